@@ -43,7 +43,8 @@ class ScaledTranslationParams(Params):
     """Settings of poses.scaled_translation."""
 
     ask_images: bool = Field(
-        default=True, description="use the images to decide between poses that the matches support about equally"
+        default=True,
+        description="use the images to weigh relative poses that the matches support about equally",
     )
     check_closures: bool = Field(
         default=True, description="of a walk, leave out pairs that join places far apart along the path"
@@ -61,8 +62,8 @@ def scaled_translation(
 ) -> Poses:
     """Solve poses by the paper's method for any capture: join relative poses by translation scale factors.
 
-    Each image is placed by all of its pairs together; if several poses agree with the pairs about equally well, the
-    images decide. Images that cannot be placed reliably are left out, each with a reason. Groups of images without a
+    Each image is placed by all of its pairs together; if many pairs agree with several relative poses, the images weigh
+    these. Images that cannot be placed reliably are left out, each with a reason. Groups of images without a
     reliable pair between them are solved separately. If the images were taken along a path, it is solved from the pairs
     in sequence first; pairs of places that look the same, but are far apart along the path, are left out.
     """

@@ -45,7 +45,7 @@ def extend_poses(
     fixed = {*model.cameras}
     model.verify_again()
     left = {*range(len(names))} - fixed
-    reasons = extend(model, left, adjust=False, confirmation=None) if fixed else {}
+    reasons = extend(model, left, adjust=False) if fixed else {}
     poses = Poses.without_points(
         {names[idx]: model.cameras[idx] for idx in sorted(model.cameras)},
         rejected={

@@ -11,15 +11,10 @@ from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement
 from pano_mvs.algorithms.poses.placement.resection import points_needed, why_refused
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_CLEAR_WITH_IMAGES = 0.4  # a placement is in doubt if the runner-up has more than this share of the best score
 
-
-def grown_model(
-    pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
-) -> tuple[PlacedModel, dict[int, str]]:
+def grown_model(pairs: Pairs, images: Collection[int], *, adjust: bool) -> tuple[PlacedModel, dict[int, str]]:
     """Return a model of a connected group of images, and why images of the group could not be added to it.
 
     It grows from the best seed or, if no image can be attached to this, from the best one that contradicts it.
@@ -28,13 +23,12 @@ def grown_model(
         pairs: all pairs of the capture.
         images: positions of the images of the group.
         adjust: whether all cameras are adjusted as the model grows.
-        confirmation: consulted only where the pairs cannot decide between placements.
     """
     models: list[tuple[PlacedModel, dict[int, str]]] = []
     tried: set[tuple[Edge, int]] = set()
     while len(models) < 2 and (seeds := ranked_seeds(pairs, images, without=tried)):
         edge, rank = seeds[0]
-        model, refused = _grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation)
+        model, refused = _grown(pairs, images, edge, rank=rank, adjust=adjust)
         models.append((model, refused))
         if not refused or len(model.cameras) > 2:
             break
@@ -91,25 +85,25 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
 
 
 def _grown(
-    pairs: Pairs, images: Collection[int], edge: Edge, *, rank: int, adjust: bool, confirmation: Confirmation | None
+    pairs: Pairs, images: Collection[int], edge: Edge, *, rank: int, adjust: bool
 ) -> tuple[PlacedModel, dict[int, str]]:
     """Return the model that grows from a seed, and the reasons for images that could not be added."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
-    reasons = extend(model, left, adjust=adjust, confirmation=confirmation)
+    reasons = extend(model, left, adjust=adjust)
     settle(model, adjust=adjust)
     return model, {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
 
 
-def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Confirmation | None) -> dict[int, str]:
+def extend(model: PlacedModel, left: set[int], *, adjust: bool) -> dict[int, str]:
     """Add images to a model one at a time, the one whose pose its pairs determine most clearly first.
 
     Args:
         model: the model, changed in place.
         left: images to add; those that were added are removed.
-        adjust: whether all cameras are adjusted each time their number has grown by a quarter.
-        confirmation: decides between rival placements by the images; None if the pairs alone decide.
+        adjust: whether all cameras are adjusted each time their number has grown by a quarter. If False, only points
+            are triangulated again.
 
     Returns:
         Why images could not be added when they were last tried.
@@ -126,29 +120,26 @@ def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Co
         count_pairs(image)
     if not adjust:
         model.adjust(cameras=False)
-    adjusted = 2
+    adjusted = len(model.cameras)
     reasons: dict[int, str] = {}
-    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
+    while step := _next(model, weights, reasons=reasons):
         image, pose = step
         model.add(image, pose)
         left.discard(image)
         del weights[image]
         count_pairs(image)
-        if not adjust or len(model.cameras) > 1.25 * adjusted:
+        if len(model.cameras) > 1.25 * adjusted:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     return reasons
 
 
-def _next(
-    model: PlacedModel, weights: Mapping[int, float], *, confirmation: Confirmation | None, reasons: dict[int, str]
-) -> tuple[int, Rigid3] | None:
+def _next(model: PlacedModel, weights: Mapping[int, float], *, reasons: dict[int, str]) -> tuple[int, Rigid3] | None:
     """Return the image to add next and its pose; None if none can be added.
 
     Args:
         model: the model to extend.
         weights: unregistered images that share pairs with registered ones, to the total weight of these pairs.
-        confirmation: decides between rival placements by the images; None if the pairs alone decide.
         reasons: receives why an image cannot be added yet.
     """
 
@@ -170,26 +161,15 @@ def _next(
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
             # Share of an image's pairs, by weight, that must agree with a clear placement.
-            clear = rival < (0.8 if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
+            clear = rival < 0.8 and share > 0.5
             if clear and (pose := accepted(image, evidence, found[0])):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))
         for _, image, evidence, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
-            for placement in _by_images(model, image, found, confirmation=confirmation):
+            for placement in found[:2]:
                 if pose := accepted(image, evidence, placement):
                     return image, pose
     return None
-
-
-def _by_images(
-    model: PlacedModel, image: int, found: list[Placement], *, confirmation: Confirmation | None
-) -> list[Placement]:
-    """Return placements in the order in which to try them; the images decide between rivals."""
-    rivals = [placement for placement in found[:2] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
-    if confirmation is None or len(rivals) < 2:
-        return found[:2]
-    shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
-    return [rivals[idx] for idx in np.argsort(-np.nan_to_num(shares), kind="stable")]
 
 
 def _polished(model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement) -> tuple[Rigid3, str]:

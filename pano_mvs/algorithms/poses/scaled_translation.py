@@ -44,8 +44,8 @@ def solve_scaled_translation(
     views that all see the first image to an unordered set. Starting from a seed pair, each image is placed by the
     rotations and directions of its pairs with registered images. The length of a translation is the one that puts
     points with known ranges at these ranges. All geometries of a pair are considered, not only the one with most
-    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses agree with
-    the pairs about equally well, the images decide (see `Confirmation`).
+    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where many pairs have several
+    geometries, the images weigh these (see `weighed_by_images`).
 
     Args:
         features: key points by image name, in the capture's order.
@@ -66,7 +66,7 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    models, reasons = solved_models(pairs, adjust=adjust, confirmation=confirmation)
+    models, reasons = solved_models(pairs, adjust=adjust)
     groups = [_finished(model, adjust=adjust) for model in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
@@ -77,9 +77,7 @@ def solve_scaled_translation(
     return join_groups(groups, order=names, rejected=rejected)
 
 
-def solved_models(
-    pairs: Pairs, *, adjust: bool = True, confirmation: Confirmation | None = None
-) -> tuple[list[PlacedModel], dict[int, str]]:
+def solved_models(pairs: Pairs, *, adjust: bool = True) -> tuple[list[PlacedModel], dict[int, str]]:
     """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
     Images that could not be added to any model are tried as models of one camera when models are joined.
@@ -88,7 +86,7 @@ def solved_models(
     reasons: dict[int, str] = {}
     waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
     while waiting:
-        model, refused = grown_model(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)
+        model, refused = grown_model(pairs, waiting.pop(0), adjust=adjust)
         grown.append(model)
         reasons |= refused
         left = {edge for edge in pairs.geometries if edge[0] in refused and edge[1] in refused}

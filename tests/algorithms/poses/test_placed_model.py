@@ -133,7 +133,7 @@ def test_the_first_seed_is_true_although_a_false_one_has_more_matches(pairs: Pai
 
 
 def test_a_grown_model_has_all_images_and_needs_no_rival(pairs: Pairs, capture: AliasedCapture) -> None:
-    grown, refused = grown_model(pairs, range(6), adjust=True, confirmation=None)
+    grown, refused = grown_model(pairs, range(6), adjust=True)
     assert refused == {}
     assert _error_deg(grown, capture) < 0.5
 

@@ -23,16 +23,12 @@ SIGNS = {
     "scale_worst": -1,
     "place_rival": -1,
     "repeats": -1,
-    "joint_contradicting": -1,
     "linked": 1,
     "links_contradicting": -1,
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 
-MEASURED = (*SIGNS, "contradicted")
-"""What tables hold. The last one is not fitted, because it is not known for all of their cameras."""
-
-OF_IMAGES, OF_PAIRS = {"ratio", "share", "joint_contradicting"}, {*SIGNS} - {"ratio", "share", "joint_contradicting"}
+OF_IMAGES, OF_PAIRS = {"ratio", "share"}, {*SIGNS} - {"ratio", "share"}
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
 ENOUGH = {"ratio": 0.35, "share": 0.25}
 """Values beyond which more of a measurement says nothing more, where places that were left out are predicted better
@@ -89,7 +85,7 @@ def read_table(path: Path) -> Cameras:
     """Return the cameras of a file that `write_table` has written."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in MEASURED}
+    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SIGNS}
     flags = {name: np.array([row[name] == "1" for row in rows], np.bool_) for name in ("right", "doubted")}
     captures = [f"{row['family']} {row['seed']} {row['variant']}" for row in rows]
     return Cameras(
@@ -101,9 +97,9 @@ def write_table(path: Path, cameras: Cameras) -> None:
     """Write cameras as CSV, with four digits of each measurement."""
     with path.open("w", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["family", "seed", "variant", "right", "doubted", *MEASURED])
+        out.writerow(["family", "seed", "variant", "right", "doubted", *SIGNS])
         for idx, capture in enumerate(cameras.capture):
-            values = [cameras.columns[name][idx] for name in MEASURED]
+            values = [cameras.columns[name][idx] for name in SIGNS]
             figures = [f"{value:.4g}" if np.isfinite(value) else "" for value in values]
             out.writerow([*capture.split(), int(cameras.right[idx]), int(cameras.doubted[idx]), *figures])
 

@@ -17,10 +17,7 @@ from pano_mvs.algorithms.learned.lightglue import match_learned
 from pano_mvs.algorithms.learned.weak_images import learned_pairs, weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
-from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
-from pano_mvs.algorithms.poses.verification.joints import measured_joints
 from pano_mvs.algorithms.poses.verification.verify_poses import VerifiedGroup, verified_group
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
@@ -35,7 +32,6 @@ VARIANTS = ("asked", "displaced", "pairs_alone", "halved", "thinned")
 every second or third image."""
 _LEFT_OUT = {"halved": 2, "thinned": 3}
 _LEARNED_KEYPOINTS, _LEARNED_VIEWS = 3000, 4
-_CONTRADICTED = 0.1
 
 
 @dataclass(frozen=True)
@@ -172,28 +168,6 @@ def _displaced(poses: Poses, rng: np.random.Generator) -> Poses:
     return Poses.without_points(cameras, frame=poses.frame, scale=poses.scale, metric=False)
 
 
-def evidence_of(found: VerifiedGroup) -> dict[int, dict[str, float]]:
-    """Return the evidence for each camera, and the share of that between its part and the rest that contradicts it.
-
-    The latter, `contradicted`, is 0 where it is below a tenth or the images confirm the part, and missing where the
-    pairs count as not measured.
-    """
-    model, checks = found.model, found.checks
-    rows = camera_evidence(
-        model,
-        checks.shares,
-        checks.expected,
-        joints=measured_joints(model, found.confirmation),
-        contradicting_before=checks.links_contradicting,
-    )
-    parts = contradicted_parts(model, checks.shares, more_than=_CONTRADICTED)
-    shares = {image: part.share for part in parts for image in part.images}
-    return {
-        image: row | {"contradicted": shares.get(image, 0.0) if np.isfinite(row["agreeing"]) else np.nan}
-        for image, row in rows.items()
-    }
-
-
 def rows_of(
     capture: Capture,
     variant: str,
@@ -214,7 +188,6 @@ def rows_of(
         limits: errors up to which a camera is right, in degrees and as a share of the extent.
     """
     placed = judge_placements(found.poses, capture.truth, rotation_limit_deg=limits[0], center_limit=limits[1])
-    evidence = evidence_of(found)
     return [
         asdict(
             Measured(
@@ -231,7 +204,7 @@ def rows_of(
                 bool(placed.doubted[idx]),
                 {
                     key: float(value) if np.isfinite(value) else None
-                    for key, value in evidence[found.model.pairs.names.index(name)].items()
+                    for key, value in found.checks.evidence[found.model.pairs.names.index(name)].items()
                 },
             )
         )

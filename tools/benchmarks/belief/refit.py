@@ -107,7 +107,7 @@ def draw(path: Path, probability: FloatArray, cameras: Cameras) -> None:
     """Write a reliability diagram: how many cameras are right, by their probability and by family."""
     from matplotlib import pyplot
 
-    figure, (axes, families) = pyplot.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
+    figure, (axes, families) = pyplot.subplots(1, 2, figsize=(10, 6.6), layout="constrained")
     right = cameras.right
     number = np.minimum((probability * BINS).astype(int), BINS - 1)
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)

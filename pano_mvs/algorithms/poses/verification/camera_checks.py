@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,11 +11,10 @@ from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.resection import points_needed
 from pano_mvs.algorithms.poses.verification.aliases import other_arrangement
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
+from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence
 from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
-from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
 from pano_mvs.geometry import Rigid3
 
 
@@ -27,6 +26,7 @@ class CameraChecks:
     shares: dict[int, float] = field(default_factory=dict)
     # image position to the share that its neighbours suggest; NaN likewise
     expected: dict[int, float] = field(default_factory=dict)
+    evidence: dict[int, Row] = field(default_factory=dict)  # image position to all measurements of its camera
     moved: set[int] = field(default_factory=set)  # images that were moved to another pose
     p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
     doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
@@ -69,7 +69,7 @@ def correct_cameras(
     if found.moved:
         _judge(model, confirmation, found)
     while True:
-        _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost)
+        _believe(model, found, miss_cost=miss_cost)
         if not _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
             return found
         _judge(model, confirmation, found)
@@ -144,16 +144,10 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
     return poses
 
 
-def _believe(
-    model: PlacedModel,
-    found: CameraChecks,
-    *,
-    joints: Sequence[Joint] = (),
-    miss_cost: float = MISS_COST,
-) -> None:
+def _believe(model: PlacedModel, found: CameraChecks, *, miss_cost: float = MISS_COST) -> None:
     """Find the probability that each camera is right, and the doubts that follow from it."""
-    rows = camera_evidence(
-        model, found.shares, found.expected, joints=joints, contradicting_before=found.links_contradicting
+    rows = found.evidence = camera_evidence(
+        model, found.shares, found.expected, contradicting_before=found.links_contradicting
     )
     contradicting = [row["links_contradicting"] for row in rows.values() if np.isfinite(row["links_contradicting"])]
     found.links_contradicting = max(contradicting, default=found.links_contradicting)

@@ -142,17 +142,6 @@ class Confirmation:
             self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
         return self._small[image]
 
-    def range_with(self, image: int, partner: int, cameras: Mapping[int, Rigid3]) -> NDArray[np.float64]:
-        """Return the ranges (128, 256) that two images confirm alone, NaN elsewhere, of the first of them."""
-        with _one_thread():
-            own, other = (
-                self._swept(one, cameras[one], [source], cameras=cameras)
-                for one, source in ((image, partner), (partner, image))
-            )
-        confirmed = _confirmed(own, cameras[image], [other], source_poses=[cameras[partner]])
-        confirmed &= self.small(image).mask
-        return np.where(confirmed, own.range, np.nan).astype(np.float64)
-
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
 

@@ -69,7 +69,6 @@ class VerifiedGroup:
     poses: Poses  # the poses, with their doubts
     model: PlacedModel  # the same cameras with their pairs
     checks: CameraChecks  # the evidence of the images for each of them
-    confirmation: Confirmation  # of the capture
 
 
 def verified_group(
@@ -92,7 +91,7 @@ def verified_group(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return VerifiedGroup(with_camera_checks(poses, pairs, checks), model, checks, confirmation)
+    return VerifiedGroup(with_camera_checks(poses, pairs, checks), model, checks)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:

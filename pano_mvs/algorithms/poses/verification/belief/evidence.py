@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
-from pano_mvs.algorithms.poses.verification.joints import Joint
 from pano_mvs.geometry import geodesic_angle
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +23,6 @@ def camera_evidence(
     shares: Mapping[int, float],
     expected: Mapping[int, float],
     *,
-    joints: Sequence[Joint] = (),
     contradicting_before: float = np.nan,
 ) -> dict[int, Row]:
     """Return the evidence for each camera of a model, which is to be measured after all choices were made.
@@ -33,7 +31,6 @@ def camera_evidence(
         model: the cameras, with their pairs if these are known.
         shares: image position to the share of its texture that other images confirm; NaN where unknown.
         expected: image position to the share that its neighbours suggest.
-        joints: of the parts of the model, as far as the images were consulted.
         contradicting_before: the largest `links_contradicting` of the model with cameras that were left out since then:
             what contradicted them speaks against those that agree with them, such as copies of a room, as well.
 
@@ -41,13 +38,12 @@ def camera_evidence(
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
         `agreeing` (number of pairs that agree), `scale_worst` (largest |log ratio| of a distance between cameras to the
         one that known points suggest), `place_rival` (weight of another place relative to its own), `repeats` (mean
-        weight of other geometries of the pairs of all cameras, relative to those in use), `joint_contradicting` (solid
-        angle in which its part and the larger rest look through one another's surfaces, relative to all that both see),
-        `linked` (weight of the learned pairs that agree less that of those that do not, across the weakest cut between
-        the camera and the larger part of those with such pairs; see `weight_of_pair`), and `links_contradicting` (share
-        of the weight of all learned pairs of the model that does not agree with its cameras), for cameras with such.
+        weight of other geometries of the pairs of all cameras, relative to those in use), `linked` (weight of the
+        learned pairs that agree less that of those that do not, across the weakest cut between the camera and the
+        larger part of those with such pairs; see `weight_of_pair`), and `links_contradicting` (share of the weight of
+        all learned pairs of the model that does not agree with its cameras), for cameras with such.
     """
-    contradicting, repeats = _contradicting_joints(joints), _repeats(model)
+    repeats = _repeats(model)
     linked, links_contradicting = _links(model)
     links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
@@ -61,7 +57,6 @@ def camera_evidence(
             "share": share,
             **(of_pairs if known else dict.fromkeys(of_pairs, np.nan)),
             "repeats": repeats,
-            "joint_contradicting": contradicting.get(image, np.nan),
             "linked": linked.get(image, np.nan),
             "links_contradicting": links_contradicting if image in linked else np.nan,
         }
@@ -127,23 +122,6 @@ def _place_rival(model: PlacedModel, image: int, own: float) -> float:
         or float(geodesic_angle(place.cam_from_world.rotation, here.rotation)) > 0.07
     )
     return next(elsewhere, 0.0) / own
-
-
-def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
-    """Return the largest contradicting share on the way, over the strongest joints, from each part to the largest."""
-    parts = sorted({part for joint in joints for part in joint.parts}, key=lambda part: (-len(part), part))
-    if not parts:
-        return {}
-    number = {part: idx for idx, part in enumerate(parts)}
-    ends = np.array([[number[part] for part in joint.parts] for joint in joints])
-    weights = csr_array((1 / np.array([1.0 + joint.matches for joint in joints]), ends.T), shape=(len(parts),) * 2)
-    order, before = breadth_first_order(minimum_spanning_tree(weights), 0, directed=False)
-    share = {frozenset(joint.parts): joint.contradicting for joint in joints}
-    worst = {parts[0]: np.nan}
-    for idx in order[1:]:
-        previous = parts[before[idx]]
-        worst[parts[idx]] = float(np.fmax(worst[previous], share[frozenset((previous, parts[idx]))]))
-    return {image: value for part, value in worst.items() for image in part}
 
 
 def _links(model: PlacedModel) -> tuple[dict[int, float], float]:

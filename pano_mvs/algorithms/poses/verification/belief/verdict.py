@@ -59,13 +59,6 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
         "no third image determines its place",
         _BETWEEN,
     ),
-    "joint_contradicting": (
-        lambda row: (
-            f"its part of the capture and the rest look through {_percent(row['joint_contradicting'])} of what both see"
-        ),
-        "nothing that two parts of the capture see in common confirms how they are joined",
-        _BETWEEN,
-    ),
     "linked": (
         lambda row: (
             f"the learned pairs that connect it with the others weigh only {max(row['linked'], 0.0):.1f} times as much "

@@ -12,7 +12,6 @@ from pano_mvs.algorithms.poses.placement import placed_model
 from pano_mvs.algorithms.poses.placement.pair_evidence import geometries_of
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
-from pano_mvs.algorithms.poses.verification.joints import Joint
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.poses.aliased_capture import view_of
 from tests.algorithms.poses.synthetic_capture import features_from_bearings
@@ -63,18 +62,6 @@ def test_shares_are_compared_with_what_is_expected() -> None:
     rows = camera_evidence(placed({}, agreeing=True), {0: 0.2, 1: 0.3}, {0: 0.4, 1: 0.0})
     assert (rows[0]["share"], rows[0]["ratio"]) == (0.2, 0.5)
     assert np.isnan(rows[1]["ratio"])
-
-
-def test_a_contradicted_joint_counts_for_all_parts_beyond_it() -> None:
-    """The weakest way between two parts does not count if there is a stronger one."""
-    joints = [
-        Joint(((0, 1, 2), (3, 4)), matches=90, contradicting=0.4),
-        Joint(((3, 4), (5,)), matches=50, contradicting=np.nan),
-        Joint(((0, 1, 2), (5,)), matches=10, contradicting=0.9),
-    ]
-    rows = camera_evidence(placed({}, agreeing=True), NOTHING, NOTHING, joints=joints)
-    found = [rows[idx]["joint_contradicting"] for idx in range(6)]
-    np.testing.assert_array_equal(found, [np.nan] * 3 + [0.4] * 3)
 
 
 def linked(

@@ -16,7 +16,6 @@ BEST = {
     "scale_worst": 0.0,
     "place_rival": 0.0,
     "repeats": 0.0,
-    "joint_contradicting": 0.0,
 }
 
 
@@ -39,7 +38,6 @@ def test_a_camera_that_everything_supports_is_right() -> None:
         ({"scale_worst": 0.05}, "contradict its distances to other cameras by 5.1 %"),
         ({"place_rival": 2.0}, "place it elsewhere with 200 % of the weight"),
         ({"repeats": 1.2}, "the place repeats"),
-        ({"joint_contradicting": 0.5}, "look through 50 %"),
     ],
 )
 def test_the_worst_measurements_are_said(worse: dict[str, float], said: str) -> None:
