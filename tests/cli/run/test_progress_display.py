@@ -127,7 +127,7 @@ def test_finished_stages_failures_and_warnings_stay() -> None:
     )
     lines = shown.stream.getvalue().splitlines()
     assert lines == [
-        "failed depth:a[b].jpg",
+        "failed depth:a[b].jpg: no light",
         "  | first",
         "  | [red]last",
         "warning: [x] is odd",

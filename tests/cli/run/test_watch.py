@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.watch_command import BlocksView, RunView, _updated, watch_run
+from pano_mvs.cli.watch_command import WatchDisplay, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.events import StageStarted, UnitFailed, UnitFinished, UnitStarted, ignore
@@ -22,7 +22,6 @@ from pano_mvs.session.progress import (
     BlockStarted,
     Event,
     EventLog,
-    EventReader,
     Forecast,
     RunFinished,
     RunStarted,
@@ -40,42 +39,62 @@ def started(folder: Path) -> RunStarted:
     return RunStarted("lobby", NAMES, "slurm", workers=6, threads=2, out=folder, cache=folder)
 
 
-def text_of(view: RunView | BlocksView) -> str:
-    stream = io.StringIO()
-    Console(file=stream, width=120).print(view.shown())
-    return stream.getvalue()
+def log_in(folder: Path, *events: Event) -> EventLog:
+    """Begin a log in a folder, with these events."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = EventLog(ignore)
+    log.open(folder)
+    for event in events:
+        log(event)
+    return log
 
 
-def test_view_of_a_run(tmp_path: Path) -> None:
-    view = RunView(tmp_path, clock=lambda: 1090.0)
+class Watched:
+    """A display of a folder, and what it shows."""
+
+    def __init__(self, folder: Path) -> None:
+        self.stream = io.StringIO()
+        self.display = WatchDisplay(folder, Console(file=self.stream, width=160))
+
+    def updated(self) -> str:
+        """Return what is printed and what is shown after the new events."""
+        self.display.update()
+        self.display.console.print(self.display.live_lines())
+        return self.stream.getvalue()
+
+    def line(self) -> str:
+        self.display.update()
+        self.display.print_line()
+        return self.stream.getvalue().splitlines()[-1]
+
+
+def test_a_run_is_shown_as_in_its_own_terminal_with_workers_disk_and_range(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.time", lambda: now[0])
     events: list[tuple[float, Event]] = [(1000, started(tmp_path)), (1000, FORECAST), (1000, StageStarted("images", 4))]
     events += [(1001 + i, UnitFinished("images", f"{i}", "run", 1.0)) for i in range(4)]
     events += [(1005, StageStarted("depth", 4)), (1005, WorkersChanged(2)), (1006, UnitStarted("depth", "0"))]
-    events += [
-        (1020, TimeLeft(500.0)),
-        (1050, TimeLeft(60.0)),
-        (1060, TimeLeft(20.0)),
-        (1060, UnitStarted("depth", "1")),
-    ]
-    events += [(1080, UnitFailed("depth", "0", "too dark")), (1080, UnitFinished("depth", "0", "failed", 74.0))]
-    for at, event in events:
-        view.take(at, event)
-    text = text_of(view)
-    assert "lobby in" in text
-    assert "slurm, 2 workers of 2 threads, 1:30" in text
-    assert re.search(r"images +━+ +4 of 4 ", text)
-    assert re.search(r"depth +━+ +1 of 4 +1 +1 +1:24", text)
+    events += [(1020, TimeLeft(500.0)), (1050, TimeLeft(60.0)), (1060, TimeLeft(20.0))]
+    events += [(1060, UnitStarted("depth", "1")), (1080, UnitFailed("depth", "0", "too dark"))]
+    events += [(1080, UnitFinished("depth", "0", "failed", 74.0))]
+    log = log_in(tmp_path)
+    for now[0], event in events:
+        log(event)
+    now[0] = 1090.0
+    text = Watched(tmp_path).updated()
+    assert f"lobby in {tmp_path}: slurm, 6 workers of 2 threads\n" in text
+    assert "failed depth:0: too dark\n" in text
+    assert re.search(r"depth +━+ +1 of 4  1:24  1\n", text)
     # The estimate of 1020 s belongs to the first half, and by that of 1060 s the run would have ended.
-    assert "about 1:08 left (0:20 to 1:08), until about " in text
+    assert re.search(r"all +[━╸╺]+ .* 1:30  about 1:0[89] left \(0:20 to 1:08\), until about \d\d:\d\d\n", text)
+    assert "2 workers; " in text
     assert "free for the cache, about 15 MB still to come" in text
-    assert "failed depth:0: too dark" in text
     assert "no event" not in text
-    assert "no event for 10 min" in text_of_later(view, 1680.0)
-
-
-def text_of_later(view: RunView, now: float) -> str:
-    view._clock = lambda: now
-    return text_of(view)
+    now[0] = 1680.0
+    assert "no event for 10 min" in Watched(tmp_path).updated()
+    log(RunFinished(0, ""))
 
 
 @pytest.mark.parametrize(
@@ -94,50 +113,35 @@ def test_watch_ends_with_the_run(end: RunFinished, said: str, tmp_path: Path) ->
     stream = io.StringIO()
     assert watch_run(tmp_path, Console(file=stream, width=120)) == end.exit_code
     assert stream.getvalue().rstrip().endswith(said)
-    assert "left" not in stream.getvalue()
 
 
-def log_in(folder: Path, *events: Event) -> EventLog:
-    """Begin a log in a folder, with these events."""
-    folder.mkdir(parents=True, exist_ok=True)
-    log = EventLog(ignore)
-    log.open(folder)
-    for event in events:
-        log(event)
-    return log
-
-
-def test_view_of_a_run_in_blocks(tmp_path: Path) -> None:
+def test_run_in_blocks(tmp_path: Path) -> None:
     blocks = tmp_path / "blocks"
     log_in(blocks / "block_2", started(blocks / "block_2"), RunFinished(4, "too few matches"))  # of an earlier run
     time.sleep(0.01)  # times are in milliseconds
     log = log_in(blocks, BlockStarted("block_1", 1, 2, images=10, images_left=5))
-    reader = EventReader(blocks)
-    view = _updated(BlocksView(blocks), reader)
-    assert view.left_text() == "block 1 of 2, 10 images; starting"
+    watched = Watched(blocks)
+    assert watched.line() == "0 %, starting"
+    assert watched.stream.getvalue().startswith("block 1 of 2, 10 images\n")
 
     first = log_in(blocks / "block_1", started(blocks / "block_1"), FORECAST, StageStarted("images", 4))
-    view = _updated(view, reader)
     # The block takes 1 s for its images, 10 s for its ranges, and the other one half of that.
     in_all = r"all blocks: about 0:1[6-9] left, if the later ones take as long"
-    assert re.fullmatch(rf"block 1 of 2, 10 images; 0 %, about 0:1[01] left .*; {in_all}", view.left_text())
-    assert re.search(rf"^block 1 of 2.*images +0 of 4 .*{in_all}\n$", text_of(view), re.DOTALL)
+    assert re.match(rf"0 %, about 1[01] s left .*; {in_all}; 6 workers", watched.line())
 
     first(RunFinished(3, "", seconds=60.0))
-    assert "block_1: finished, but some items failed" in text_of(_updated(view, reader))
+    assert "block_1: finished, but some items failed" in watched.updated()
     log(BlockStarted("block_2", 2, 2, images=5, images_left=0))
-    view = _updated(view, reader)
-    assert view.left_text() == "block 2 of 2, 5 images; starting"
-    assert "too few matches" not in text_of(view)
+    assert watched.line() == "0 %, starting"
+    assert "block 2 of 2, 5 images\n" in watched.stream.getvalue()
 
-    second = log_in(blocks / "block_2", started(blocks / "block_2"), FORECAST)
-    view = _updated(view, reader)
-    assert re.fullmatch(r"block 2 of 2, 5 images; 0 %, about .*", view.left_text())
-    assert "all blocks" not in view.left_text()
-    second(RunFinished(0, "", seconds=50.0))
-    assert _updated(view, reader).left_text().endswith("; all blocks have run")
+    log_in(blocks / "block_2", started(blocks / "block_2"), FORECAST, RunFinished(0, "", seconds=50.0))
+    assert "all blocks" not in watched.line()
+    assert "block_2: finished (exit code 0) after 50 s\n" in watched.stream.getvalue()
+    assert "too few matches" not in watched.stream.getvalue()
     log(RunFinished(3, ""))
-    assert "all blocks" not in text_of(_updated(view, reader))
+    watched.display.update()
+    assert watched.display.end == RunFinished(3, "")
 
 
 def test_watch_ends_with_the_run_in_blocks(tmp_path: Path) -> None:
@@ -188,9 +192,7 @@ def test_watch_follows_a_run_from_another_process(toy: Toy) -> None:
     done = subprocess.run(watch, capture_output=True, text=True, check=False)
     process.communicate()
     assert (done.returncode, done.stderr) == (0, "")
-    first, *_ = done.stdout.splitlines()
-    assert re.match(r"\d+ %, ", first)
-    assert re.search(r"mean +━+ +5 of 5 ", done.stdout)
+    assert re.search(r"^mean +5 run, ", done.stdout, re.MULTILINE)
     assert re.match(r"finished \(exit code 0\) after ", done.stdout.splitlines()[-1])
 
 
