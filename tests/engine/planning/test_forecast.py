@@ -9,7 +9,14 @@ import pytest
 
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
-from pano_mvs.engine.planning.forecast import StageForecast, expected_memory, forecast, makespan, settings_digest
+from pano_mvs.engine.planning.forecast import (
+    Experience,
+    StageForecast,
+    expected_memory,
+    forecast,
+    makespan,
+    settings_digest,
+)
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.workflows.workflow import Workflow
@@ -20,14 +27,8 @@ def forecast_of(toy: Toy, *overrides: str) -> dict[str, StageForecast]:
     session, listing = toy.session(*overrides), SourceListing()
     store = Store(session.store_root)
     plans = make_plan(session.workflow, session.graph, store, listing=listing)
-    found = forecast(
-        plans,
-        session.workflow,
-        session.graph,
-        size=listing.size(),
-        histories=(store.unit_times, UnitTimes(toy.folder / "reference.json")),
-        threads=1,
-    )
+    experience = Experience(listing.size(), (store.unit_times, UnitTimes(toy.folder / "reference.json")))
+    found = forecast(plans, session.workflow, session.graph, experience=experience)
     return {one.stage: one for one in found}
 
 
@@ -83,8 +84,7 @@ def test_the_memory_of_stages_for_the_whole_capture_grows_with_it(toy: Toy) -> N
     workflow = replace(session.workflow, stages=stages)
 
     def memory(images: int, workflow: Workflow = workflow) -> dict[str, float]:
-        size = CaptureSize(images, 2.0)
-        return expected_memory(workflow, session.graph, size=size, histories=(reference,), threads=1)
+        return expected_memory(workflow, session.graph, Experience(CaptureSize(images, 2.0), (reference,)))
 
     assert memory(10) == {"all": 10_000.0}
     reference.add(spec.name, Sample(settings_digest(entry), 1, 5, 1.0, 1, seconds=9.0, stored_bytes=100.0))
