@@ -11,11 +11,11 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.cli.cache.command import size_text
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_verdict
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import write_given
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord

@@ -90,7 +90,7 @@ def test_a_run_is_shown_as_in_its_own_terminal_with_workers_disk_and_range(
     # The estimate of 1020 s belongs to the first half, and by that of 1060 s the run would have ended.
     assert re.search(r"all +[━╸╺]+ .* 1:30  about 1:0[89] left \(0:20 to 1:08\), until about \d\d:\d\d\n", text)
     assert "2 workers; " in text
-    assert "free for the cache, about 15 MB still to come" in text
+    assert "free for the cache, about 15.0 MB still to come" in text
     assert "no event" not in text
     now[0] = 1680.0
     assert "no event for 10 min" in Watched(tmp_path).updated()

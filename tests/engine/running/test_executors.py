@@ -450,7 +450,7 @@ def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.
     )
     result = run_with(toy, SerialExecutor)
     refused = [failure for failure in result.failures if failure.stage == "mean"]
-    assert all("declares 2 MB of memory, and 1 MB are free" in failure.cause for failure in refused)
+    assert all("declares 2.0 MB of memory, and 1.0 MB are free" in failure.cause for failure in refused)
     assert 0 < len(refused) < 5
     assert not run_with(toy, SerialExecutor, "mean.memory=1MB", name="y").failures
 
