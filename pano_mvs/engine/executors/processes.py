@@ -22,9 +22,9 @@ from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.started_processes import MARK, end_started
 from pano_mvs.engine.executors.threads import bound_environment
 from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.executors.worker import MARK, end_started
 
 UNITS_PER_PROCESS = 500
 """A worker is replaced after this many units, so that memory leaks of libraries do not add up."""

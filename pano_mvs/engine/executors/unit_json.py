@@ -18,7 +18,7 @@ from pano_mvs.core.paths import reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
-from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.params import Params, json_settings
 from pano_mvs.engine.stages.stage import Cardinality, SourceItem, StageSpec
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.policy import Policy
@@ -96,7 +96,7 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
         "use": spec.name,
         "version": spec.version,
         "code": spec.code_digest,
-        "params": _plain(unit.entry.params),
+        "params": json_settings(unit.entry.params, Path.absolute),
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in inputs.items()}
@@ -174,24 +174,6 @@ def _changed(spec: StageSpec) -> str:
         f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed during the "
         "run, or another version is installed there. Run the same command again"
     )
-
-
-def _plain(params: Params) -> dict[str, Any]:
-    plain = _with_absolute_paths(params.model_dump(mode="python"), params.model_dump(mode="json"))
-    assert isinstance(plain, dict)
-    return plain
-
-
-def _with_absolute_paths(value: Any, as_json: Any) -> Any:
-    """Return the JSON form of a value with all paths made absolute."""
-    if isinstance(value, Path):
-        return str(value.absolute())
-    if isinstance(as_json, dict) and isinstance(value, dict):
-        pairs = zip(value.values(), as_json.items(), strict=True)
-        return {name: _with_absolute_paths(inner, inner_json) for inner, (name, inner_json) in pairs}
-    if isinstance(as_json, list) and isinstance(value, list | tuple):
-        return [_with_absolute_paths(*pair) for pair in zip(value, as_json, strict=True)]
-    return as_json
 
 
 def _large_ports(unit: Unit) -> tuple[str, ...]:

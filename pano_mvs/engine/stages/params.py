@@ -92,6 +92,20 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     return plain, paths
 
 
+def json_settings(params: Params, place: Callable[[Path], Path]) -> dict[str, Any]:
+    """Return settings as JSON values, with another path in the place of each."""
+    values = {name: _placed(getattr(params, name), place) for name in type(params).model_fields}
+    return type(params).model_construct(**values).model_dump(mode="json", by_alias=True)
+
+
+def _placed(value: Any, place: Callable[[Path], Path]) -> Any:
+    if isinstance(value, Path):
+        return place(value)
+    if isinstance(value, dict):
+        return {key: _placed(inner, place) for key, inner in value.items()}
+    return type(value)(_placed(inner, place) for inner in value) if isinstance(value, list | tuple) else value
+
+
 def registered_files(params: Params) -> dict[str, Path]:
     """Return each setting that holds a name registered by a plugin, and the plugin's file, whose code counts."""
     found: dict[str, Path] = {}
