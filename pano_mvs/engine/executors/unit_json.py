@@ -87,7 +87,11 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
     spec = unit.entry.spec
     large = _large_ports(unit) if inputs_file is not None else ()
     inputs = {port: value for port, value in unit.inputs.items() if port not in large}
-    identity = dict(unit.identity)
+    identity, source = dict(unit.identity), None
+    if unit.source is not None:
+        files = {role: str(path.absolute()) for role, path in unit.source.files.items()}
+        digests = dict(unit.source.digests)
+        source = {"name": unit.source.name, "files": files, "links": unit.source.links, "digests": digests}
     if large:
         identity["inputs"] = {name: [] if name in large else part for name, part in identity["inputs"].items()}
     return {
@@ -103,7 +107,7 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
         | {port: {"many": {}} for port in large},
         "inputs_file": str(inputs_file.absolute()) if large and inputs_file else "",
         "external": _external_files(_refs(inputs), store),
-        "source": None if unit.source is None else _source_to_json(unit.source),
+        "source": source,
         "key": unit.key,
         "identity": identity,
     }
@@ -126,6 +130,10 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     inputs = {port: _input_from_json(value) for port, value in text["inputs"].items()}
     if text["inputs_file"]:
         _read_large_inputs(Path(text["inputs_file"]), inputs, text["identity"], store=store)
+    source = text["source"]
+    if source is not None:
+        files = {role: Path(path) for role, path in source["files"].items()}
+        source = SourceItem(source["name"], files, links=tuple(source["links"]), digests=source["digests"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
@@ -133,7 +141,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
         inputs=inputs,
         key=text["key"],
         identity=text["identity"],
-        source=None if text["source"] is None else _source_from_json(text["source"]),
+        source=source,
     )
 
 
@@ -215,13 +223,3 @@ def _input_from_json(value: Any) -> UnitInput:
     if "names" in value:
         return dict.fromkeys(value["names"], PENDING)
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
-
-
-def _source_to_json(item: SourceItem) -> dict[str, Any]:
-    files = {role: str(path.absolute()) for role, path in item.files.items()}
-    return {"name": item.name, "files": files, "links": item.links, "digests": dict(item.digests)}
-
-
-def _source_from_json(value: Mapping[str, Any]) -> SourceItem:
-    files = {role: Path(path) for role, path in value["files"].items()}
-    return SourceItem(value["name"], files, links=tuple(value["links"]), digests=value["digests"])
