@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
-from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
-from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
+from pano_mvs.report.cloud import CloudPictures, TurnableCloud, cloud_pictures, turnable_cloud
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
 from pano_mvs.report.view_cards import (
