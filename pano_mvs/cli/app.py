@@ -197,7 +197,7 @@ class RunArguments:
 def run(given: RunArguments) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import run_decided
-    from pano_mvs.cli.run.ending import notified
+    from pano_mvs.cli.run.command import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.merging.block_runs import decision_of
     from pano_mvs.session.running import Execution
@@ -595,7 +595,7 @@ def inspect_pixel(
 ) -> None:
     """Analyse one pixel: its ray, its range after each stage, and its cost for every depth hypothesis."""
     from pano_mvs.cli.inspect_command import PixelWanted, inspect
-    from pano_mvs.session.commands import reopen
+    from pano_mvs.session.session import reopen
 
     session = reopen(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)

@@ -19,12 +19,11 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
-from pano_mvs.session.commands import run_command
 from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, block_runs, divided
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.progress import Divided, Event, RunFinished
 from pano_mvs.session.running import Execution
-from pano_mvs.session.session import Session
+from pano_mvs.session.session import Session, run_command
 
 _SAME_COMMAND = "give the same command again; finished results are reused"
 

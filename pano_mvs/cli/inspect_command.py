@@ -24,8 +24,7 @@ from pano_mvs.evaluation.tables import finite_or_none
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
-from pano_mvs.session.commands import run_command
-from pano_mvs.session.session import Session
+from pano_mvs.session.session import Session, run_command
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.curves import curve_text
 from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel

@@ -30,10 +30,9 @@ from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
 from pano_mvs.engine.workflows.yaml_text import Located
 from pano_mvs.results.summary import RUN_JSON, RunSummary
-from pano_mvs.session.commands import reopen, run_command
 from pano_mvs.session.planning import RunPlan, plan_session
 from pano_mvs.session.running import Execution
-from pano_mvs.session.session import Session, check_output, presets_folder
+from pano_mvs.session.session import Session, check_output, presets_folder, reopen, run_command
 
 _SHOWN_REASONS = 5
 

@@ -214,7 +214,10 @@ def _register(summary: RunSummary, found: _Collected) -> None:
     """Suggest panoramas between images without a pose and the registered ones with which they share most."""
     poses = summary.poses
     best = _best_partners(poses)
-    left_out = [name for name in poses.rejected if not _unreadable(summary, name)]
+    # Those that the source left out, as not being panoramas, for example, need no others beside them.
+    sources = {stage.name for stage in summary.stages if stage.use.startswith("source.")}
+    unreadable = {name for name, rejection in summary.rejected.items() if rejection.stage in sources}
+    left_out = [name for name in poses.rejected if name not in unreadable]
     with_partner = sorted((name for name in left_out if name in best), key=lambda name: _strength(best[name]))[::-1]
     for name in with_partner[:_MAX_UNREGISTERED]:
         link = best[name]
@@ -242,12 +245,6 @@ def _best_partners(poses: PosesSummary) -> dict[str, PairLink]:
 
 def _strength(link: PairLink) -> tuple[int, int]:
     return link.inliers, link.candidates or 0
-
-
-def _unreadable(summary: RunSummary, name: str) -> bool:
-    """Return whether an image was left out by its source, as not being a panorama, for example."""
-    sources = {stage.name for stage in summary.stages if stage.use.startswith("source.")}
-    return name in summary.rejected and summary.rejected[name].stage in sources
 
 
 def _matches(inliers: int, candidates: int | None) -> str:
@@ -282,12 +279,6 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
     _all_too_close(group, found)
 
 
-def _too_close(group: CameraGroup, first: int, second: int) -> bool:
-    """Return whether a panorama between two cameras would be too close to both to be of use."""
-    known = group.typical_range(first)
-    return known is not None and group.distance(first, second) < SHORT_BASELINE * known
-
-
 def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
     known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
@@ -319,7 +310,10 @@ def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:
     limit = max(FAIR_CONSISTENT, _WEAK * usual)
     for idx, name in enumerate(group.names):
         other = int(group.nearest(idx)[0])
-        if shares.get(name, 1.0) < limit and not _too_close(group, idx, other):
+        known = group.typical_range(idx)
+        # A panorama between two cameras that are too close would be of no use.
+        is_close = known is not None and group.distance(idx, other) < SHORT_BASELINE * known
+        if shares.get(name, 1.0) < limit and not is_close:
             reason = f"other views confirm {share(shares[name])} of {name}, and {share(usual)} of the median view"
             _stand_between(group, found, (idx, other), severity=_Severity.WEAK, reason=reason)
 

@@ -28,7 +28,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.executors.unit_requests import request_to_json
 from pano_mvs.engine.stages.stage_code import code_texts
 
 _CONNECT_S = 20.0

@@ -23,7 +23,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment
-from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.executors.unit_requests import request_to_json
 from pano_mvs.engine.executors.worker import MARK, end_started
 
 UNITS_PER_PROCESS = 500

@@ -39,7 +39,7 @@ def main() -> None:
             ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(requests_in, requests, os.environ.get(MARK, "")), daemon=True).start()
-    from pano_mvs.engine.executors.worker_requests import run_request  # after the streams, because imports may print
+    from pano_mvs.engine.executors.unit_requests import run_request  # after the streams, because imports may print
 
     _answer(answers_out, {"ready": True})
     while True:

@@ -184,7 +184,11 @@ class ReadyQueue:
         self._open_behind(name)
 
     def _wait(self, stage: _Stage, item: str) -> None:
-        tokens = {token for token in self._needs(stage, item) if not self._is_available(token)}
+        tokens = {
+            (name, unit)
+            for name, unit in self._needs(stage, item)
+            if (name not in self._complete if unit is None else unit in self.states[name].pending)
+        }
         if not tokens:
             heapq.heappush(self._ready, (stage.position, stage.rank[item], stage.entry.name, item))
             return
@@ -204,10 +208,6 @@ class ReadyQueue:
                 yield from ((producer, near) for near in stage.resolver.near[item])
             else:
                 yield producer, item if cardinality is Cardinality.EACH else WHOLE
-
-    def _is_available(self, token: Token) -> bool:
-        name, item = token
-        return name in self._complete if item is None else item not in self.states[name].pending
 
     def _block(self, stage: _Stage, item: str, reason: str) -> None:
         self.states[stage.entry.name].failed[item] = reason

@@ -20,8 +20,7 @@ from typing import Any
 import pytest
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.run.command import interrupted_by_termination
-from pano_mvs.cli.run.ending import notified
+from pano_mvs.cli.run.command import interrupted_by_termination, notified
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.processes import start_of
@@ -31,8 +30,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.captures import run as run_workflow
-from pano_mvs.session.commands import reopen, run_command
-from pano_mvs.session.session import open_session
+from pano_mvs.session.session import open_session, reopen, run_command
 from tests.cli.conftest import Command
 from tests.engine.conftest import PATIENCE_S, Toy, finished_records, start, wait_for_records
 from tests.engine.running.test_run import BEFORE_MEANS, hold_means, wait_for_means

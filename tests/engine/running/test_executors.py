@@ -24,7 +24,7 @@ from pano_mvs.engine.executors.choose import SerialExecutor, make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
-from pano_mvs.engine.executors.unit_json import unit_from_json, unit_to_json, write_large_inputs
+from pano_mvs.engine.executors.unit_requests import unit_from_json, unit_to_json, write_large_inputs
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.run import Run

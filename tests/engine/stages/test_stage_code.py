@@ -19,7 +19,7 @@ import pytest
 
 import pano_mvs
 from pano_mvs.core.errors import PanoMvsError, UsageError
-from pano_mvs.engine.executors.unit_json import require_same_code
+from pano_mvs.engine.executors.unit_requests import require_same_code
 from pano_mvs.engine.stages import stage_code as stage_code_module
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry

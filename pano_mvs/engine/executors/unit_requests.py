@@ -1,26 +1,33 @@
-"""Convert units of work to JSON and back, for workers that share only the cache with the main process.
+"""Units as requests to workers, which share only the cache with the main process: written as JSON, read and served.
 
 A stage that combines all pairs may have half a million inputs. Such large inputs are written into a file in the cache,
-some in each line, so that neither process holds all of them as text.
+some in each line, so that neither process holds all of them as text. Workers keep loaded stages and opened caches
+between units.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.errors import PanoMvsError, PluginError, StoreError, UsageError
 from pano_mvs.core.files import make_folder
-from pano_mvs.core.paths import reason_of
+from pano_mvs.core.paths import is_inside, reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors.protocol import Job
+from pano_mvs.engine.executors.execute import unit_outcome
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.stages.params import Params, json_settings
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, SourceItem, StageSpec
-from pano_mvs.engine.stages.stage_code import stage_code
+from pano_mvs.engine.stages.stage_code import code_digest, stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -223,3 +230,74 @@ def _input_from_json(value: Any) -> UnitInput:
     if "names" in value:
         return dict.fromkeys(value["names"], PENDING)
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
+
+
+def run_request(request: Mapping[str, Any]) -> JobOutcome:
+    """Compute the unit of a request; see `request_to_json`."""
+    try:
+        store = _store(*request["store"])
+        given, texts = request["plugins"], request.get("plugin_texts", {})
+        # Files sent with the request are written to a temporary folder.
+        files = {path: _written(digest, *texts[path]) if path in texts else path for path, digest in given.items()}
+        plugins = {files[path]: digest for path, digest in given.items()}
+        unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
+    except PanoMvsError as error:
+        return JobOutcome("stopped", cause=str(error), error="UsageError")
+    outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
+    for path, here in files.items():  # name the original file rather than the copy here
+        if here != path:
+            outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
+    return outcome
+
+
+_folders: dict[str, TemporaryDirectory[str]] = {}
+
+
+def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
+    if digest not in _folders:
+        folder = _folders[digest] = TemporaryDirectory(prefix="pano-mvs-plugin-")
+        for relative, text in texts.items():
+            path = Path(folder.name) / relative
+            if not is_inside(path, Path(folder.name)):
+                raise UsageError(
+                    f"plugin {name} imports {relative}, which is not beside it, so that it cannot be sent to workers"
+                )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return str(Path(_folders[digest].name) / name)
+
+
+@cache
+def _store(root: str, durable: bool, min_free_bytes: int) -> Store:
+    return Store(Path(root), durable=durable, min_free_bytes=min_free_bytes)
+
+
+@cache
+def _installed() -> Registry:
+    return Registry.installed()
+
+
+@cache
+def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
+    """Load plugin files with the given digests of their code."""
+    registry = Registry()
+    for path, digest in plugins:
+        registry.add_file(Path(path))
+        if code_digest(Path(path)) != digest:
+            raise UsageError(
+                f"plugin {path} is not the same in the worker: it was changed during the run. Run "
+                "the same command again"
+            )
+    return registry
+
+
+def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
+    """Return a stage by name, from the plugin files or the installed ones, after loading what it may use."""
+    spec = _of_files(tuple(plugins.items())).stages.get(name)
+    if spec is None:
+        # Before the first unit, because numba reads its maximum number of threads when it is loaded.
+        importlib.import_module("numba")
+        spec = _installed().stages.get(name)
+    if spec is None:
+        raise PluginError(f"the worker knows no stage {name!r}; {_installed().suggest(name)}")
+    return spec
