@@ -23,6 +23,7 @@ from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.core.processes import process_place
 from pano_mvs.engine.cache import store as store_module
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.cache.maintenance import collect, verify
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.running import run as run_module
@@ -688,3 +689,17 @@ def test_what_a_process_that_has_ended_left_half_written_goes_at_once(tmp_path: 
     (left / "half").write_bytes(b"x")
     Store(tmp_path)
     assert [path.name for path in folder.iterdir()] == [own.name]
+
+
+def test_cache_keeps_to_its_layout(toy: Toy) -> None:
+    root = toy.folder / "cache"
+    assert toy.run().exit_code == 0
+    assert {len(path.name) for name in ("records", "blobs") for path in (root / name).iterdir()} == {3}
+    assert toy.run().computed == 0
+    store = Store(root)
+    damage = verify(store)
+    assert damage.records == len(list((root / "records").rglob("*.json")))
+    assert not damage.foreign
+    found = collect(store, unused_s=-1, forget_after_s=-1)
+    assert len(found.records) == damage.records
+    assert len(found.blobs) == damage.blobs
