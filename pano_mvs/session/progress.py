@@ -25,12 +25,13 @@ from pydantic import TypeAdapter, ValidationError
 from pano_mvs.core.text import json_without_controls
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.dispatcher import LOG_FOLDER
-from pano_mvs.engine.running.events import RunEvent, Warned
+from pano_mvs.engine.running.events import RunEvent
 from pano_mvs.engine.running.events import StageFinished as StageFinished  # these are passed on
 from pano_mvs.engine.running.events import StageStarted as StageStarted
 from pano_mvs.engine.running.events import UnitFailed as UnitFailed
 from pano_mvs.engine.running.events import UnitFinished as UnitFinished
 from pano_mvs.engine.running.events import UnitStarted as UnitStarted
+from pano_mvs.engine.running.events import Warned as Warned
 from pano_mvs.results.records import Verdict
 
 

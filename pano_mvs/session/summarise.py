@@ -63,8 +63,6 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
     )
     results = final_stages(run)
     poses = _poses(run, blocked)
-    # What to say about the unit of the largest group: nothing if it is the metre or no floor is known.
-    height = poses.groups[0].camera_height if poses.groups and not poses.metric else None
     return RunSummary(
         workflow=WorkflowSummary(
             name=workflow.name,
@@ -95,10 +93,7 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
         warnings=tuple(result.warnings),
-        notes=(
-            *(note for summary in result.stages for note in summary.notes),
-            *(() if height is None else (height_note(height),)),
-        ),
+        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(poses)),
         results=results,
         poses=poses,
         scores=next(iter(scores.values()), ScoresSummary()),
@@ -286,6 +281,12 @@ def _up(poses: Poses) -> Direction | None:
         return None
     x, y, z = (round(float(value), 6) for value in up)
     return x, y, z
+
+
+def _scale_notes(poses: PosesSummary) -> tuple[str, ...]:
+    """Return what to say about the unit of the largest group: nothing if it is the metre or no floor is known."""
+    height = poses.groups[0].camera_height if poses.groups else None
+    return () if height is None or poses.metric else (height_note(height),)
 
 
 def _scores(run: Run) -> dict[str, ScoresSummary]:

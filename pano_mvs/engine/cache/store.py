@@ -23,7 +23,7 @@ from pathlib import Path
 from sys import intern
 from typing import Any
 
-from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_value
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import (
     CACHE_MARK,
@@ -412,6 +412,18 @@ class Store:
             raise UsageError(
                 f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with --cache DIR"
             ) from error
+
+
+def is_intact(place: Path | Packed, digest: str, *, is_record: bool) -> bool:
+    """Return whether a stored value is what its name says: a record that has this key, or bytes that have this digest.
+
+    Raises:
+        OSError: if it cannot be read.
+    """
+    if is_record:
+        record = record_from_bytes(place.read_bytes() if isinstance(place, Packed) else read_regular(place))
+        return record is not None and record.key == digest
+    return (place.content_digest() if isinstance(place, Packed) else digest_from_file(place)) == digest
 
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:
