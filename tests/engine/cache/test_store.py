@@ -117,16 +117,6 @@ def test_read_of_a_flipped_blob_is_refused_and_removes_it(tmp_path: Path) -> Non
     assert not path.exists()
 
 
-def test_no_pickle_is_read(tmp_path: Path) -> None:
-    ref = Store(tmp_path).put_value(Sample(np.ones((2, 2), np.float32), (), (), 1.0))
-    store = Store(tmp_path)
-    path = store.blobs.path(ref.parts["array"])
-    np.save(path, np.array([{"an": "object"}], dtype=object), allow_pickle=True)
-    store.blobs._verified.add(ref.parts["array"])
-    with pytest.raises(DamagedBlobError, match="Python objects"):
-        store.load(ref, Sample)
-
-
 def test_caches_are_marked_also_those_of_earlier_versions(tmp_path: Path) -> None:
     Store(tmp_path / "a")
     mark = tmp_path / "a" / CACHE_MARK

@@ -64,31 +64,6 @@ def test_the_models_of_presets_need_no_ranges() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "place", "what"),
-    [
-        ("pano_mvs: 1\npano_mvs: 1\nstages: {}", "wf.yaml:2:1", "occurs twice"),
-        ("pano_mvs: 1\nstagse: {}", "wf.yaml:2:1", "unknown key 'stagse'. Did you mean 'stages'?"),
-        ("stages: {a: {use: x}}", "wf.yaml:1:1", "`pano_mvs: 1` is missing"),
-        ("pano_mvs: 7\nstages: {a: {use: x}}", "wf.yaml:1:11", "workflow format 7"),
-        ("pano_mvs: 1\nstages: [a]", "wf.yaml:2:9", "must be a mapping"),
-        ("pano_mvs: 1\nstages: {a: {path: capture}}", "wf.yaml:2:10", "needs `use: NAME`"),
-        ("pano_mvs: 1\nstages: {../a: {use: x}}", "wf.yaml:2:10", "must consist"),
-        ("pano_mvs: !!python/object:os.system 1", "wf.yaml:1:11", "is not allowed"),
-        ("pano_mvs: [1", "wf.yaml", "expected"),
-        ("", "wf.yaml:1:1", "empty"),
-        ("pano_mvs: 1\nname: a/b\nstages: {a: {use: x}}", "wf.yaml:2:7", "name must consist"),
-        ("pano_mvs: 1\nplugins: plug.py\nstages: {a: {use: x}}", "wf.yaml:2:10", "must be a list"),
-        ("pano_mvs: 1\nplugins: [gone.py]\nstages: {a: {use: x}}", "wf.yaml:2:11", "does not exist"),
-        ("[" * 10_000, "wf.yaml", "nested too deeply"),
-        ("pano_mvs: " + "9" * 10_000, "wf.yaml:1:11", "not a usable number"),
-    ],
-)
-def test_mistakes_of_form(toy: Toy, text: str, place: str, what: str) -> None:
-    found = problems(toy, text)
-    assert any(line.startswith(place) and what in line for line in found), found
-
-
-@pytest.mark.parametrize(
     ("code", "what"),
     [
         ("import no_such_module", r"plug.py:1: ModuleNotFoundError"),
