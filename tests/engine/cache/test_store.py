@@ -162,18 +162,13 @@ def test_much_damage_takes_few_passes(toy: Toy, monkeypatch: pytest.MonkeyPatch)
 def test_input_that_is_gone_while_a_stage_reads_it_is_no_fault_of_the_stage(toy: Toy) -> None:
     """As when somebody collects it in that very moment."""
     mark, blobs = toy.folder / "mark", toy.folder / "cache" / "blobs"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            f'''    """Multiply."""
-    import pathlib, shutil
-    if not (mark := pathlib.Path({str(mark)!r})).exists():
-        mark.touch()
-        shutil.rmtree({str(blobs)!r})
-        raise FileNotFoundError("no such file")''',
-        ),
-    )
+    toy.begin(f"""
+import pathlib, shutil
+if not (mark := pathlib.Path({str(mark)!r})).exists():
+    mark.touch()
+    shutil.rmtree({str(blobs)!r})
+    raise FileNotFoundError("no such file")
+""")
     result = toy.run()
     assert (result.exit_code, result.failures) == (0, [])
     assert any("is missing; the same command computes it again" in text for text in result.warnings)

@@ -534,16 +534,14 @@ def hold_means(toy: Toy) -> Path:
     """Let means begin, and then wait as long as the file exists that is returned; each that waits leaves a mark."""
     hold = toy.folder / "hold"
     hold.touch()
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Mean of the neighbours and the own."""',
-            f'''    """Mean of the neighbours and the own."""
-    import pathlib
-    hold = pathlib.Path({str(hold)!r})
-    if hold.exists(): hold.with_name(f"waits-{{own.value}}").touch()
-    while hold.exists(): time.sleep(0.01)''',
-        ),
+    toy.begin(
+        f"""
+import pathlib
+hold = pathlib.Path({str(hold)!r})
+if hold.exists(): hold.with_name(f"waits-{{own.value}}").touch()
+while hold.exists(): time.sleep(0.01)
+""",
+        of="Mean of the neighbours and the own.",
     )
     return hold
 
