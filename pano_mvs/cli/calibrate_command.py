@@ -20,6 +20,7 @@ def calibrate(
     photos: Annotated[
         Path, typer.Argument(metavar="PHOTOS", help="Folder of the raw pictures of a two-lens camera, unstitched.")
     ],
+    *,
     to: Annotated[Path, typer.Option("--out", metavar="FILE.yaml", help="Calibration file to write.")],
     names: Annotated[
         str, typer.Option("--lenses", help="Names of the lenses; in file or folder names, if they are stored apart.")
