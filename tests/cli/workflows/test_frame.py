@@ -84,7 +84,8 @@ def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Pa
     assert told["frame"].startswith("origin at the first registered camera; y down along gravity, by ")
     np.testing.assert_array_equal(told["centers"][0], 0)
     ranges = {name: read_range_tiff(Path("out") / f"range/{name}.tiff") for name in ("000", "001", "002", "003")}
-    depths = np.load(capture / "truth" / "depth.npz")
+    with np.load(capture / "truth" / "depth.npz") as file:
+        depths = dict(file)
     for name, estimate in ranges.items():
         ratios = (estimate / depths[name])[np.isfinite(estimate) & np.isfinite(depths[name])]
         assert np.median(ratios) == pytest.approx(1, abs=0.03), name

@@ -146,7 +146,8 @@ def _check_models(out: Path, rooms: Path) -> None:
 
 def _check_ranges(out: Path, rooms: Path) -> None:
     """The large room keeps the unit that its poses had, half a metre each; the small one was scaled to metres."""
-    depths = np.load(rooms / "capture" / "truth" / "depth.npz")
+    with np.load(rooms / "capture" / "truth" / "depth.npz") as file:
+        depths = dict(file)
     for name in (*LARGE, *SMALL):
         found = read_range_tiff(out / f"range/{name[:2]}.tiff")
         ratios = (found / depths[name[:2]])[np.isfinite(found) & np.isfinite(depths[name[:2]])]
