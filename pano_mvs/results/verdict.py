@@ -111,10 +111,6 @@ GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
 GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 # No other view confirms walls without texture: a third of the pixels of a furnished room is a good share.
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
-# A ceiling or floor of which other views confirm less than this is reported, because its ranges may be far off.
-FAIR_CONFIRMED_SIDE = 0.15
-# A model is bad if more than half of its cameras are doubtful.
-FAIR_UNDOUBTED = 0.5
 
 
 def mood_of(value: float, good: float, fair: float) -> str:
@@ -200,7 +196,7 @@ def _registration(summary: RunSummary) -> Iterator[Finding]:
 
 def doubt_mood(poses: PosesSummary) -> str:
     """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
-    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
+    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, 0.5)
 
 
 def _doubts(summary: RunSummary) -> Iterator[Finding]:
@@ -328,7 +324,8 @@ def _views(summary: RunSummary) -> Iterator[Finding]:
     # Most ranges above or below the cameras may be unconfirmed, in half of the views.
     for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
         confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
-        if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
+        # With less than this, ranges of a ceiling or floor may be far off.
+        if confirmed is not None and confirmed < 0.15:
             yield Finding(
                 "fair",
                 f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
