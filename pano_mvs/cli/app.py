@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import shlex
 import sys
 from dataclasses import dataclass, fields
 from functools import partial
@@ -18,7 +19,8 @@ import typer
 from rich.markup import escape
 
 from pano_mvs import __version__
-from pano_mvs.cli.cache.app import cache_app
+from pano_mvs.cli.cache_commands import cache_app
+from pano_mvs.cli.calibrate_command import calibrate
 from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
@@ -195,7 +197,7 @@ class RunArguments:
 def run(given: RunArguments) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import run_decided
-    from pano_mvs.cli.run.ending import notified
+    from pano_mvs.cli.run.command import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.merging.block_runs import decision_of
     from pano_mvs.session.running import Execution
@@ -520,60 +522,7 @@ def share(
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 
-@app.command("calibrate")
-@guarded
-def calibrate_lenses(
-    photos: Annotated[
-        Path, typer.Argument(metavar="PHOTOS", help="Folder of the raw pictures of a two-lens camera, unstitched.")
-    ],
-    to: Annotated[Path, typer.Option("--out", metavar="FILE.yaml", help="Calibration file to write.")],
-    names: Annotated[
-        str, typer.Option("--lenses", help="Names of the lenses; in file or folder names, if they are stored apart.")
-    ] = "front,back",
-    layout: Annotated[str, typer.Option("--layout", help="auto, side_by_side, folders or suffixes.")] = "auto",
-    distance: Annotated[
-        str,
-        typer.Option(
-            "--distance",
-            metavar="LENGTH",
-            help="Measured distance between the centres of the lenses, such as 28mm; without it, poses are not in "
-            "metres.",
-            show_default=False,
-        ),
-    ] = "",
-    field_of_view: Annotated[
-        float,
-        typer.Option(
-            "--field-of-view",
-            min=0,
-            max=280,
-            help="Rough angle of the image circles in degrees, a start value; 0: by camera, otherwise 195.",
-        ),
-    ] = 0.0,
-    up: Annotated[
-        str,
-        typer.Option(
-            "--up", help="Side of the first lens's picture where the top of the scene is, for upright panoramas."
-        ),
-    ] = "top",
-    captures: Annotated[
-        int, typer.Option("--captures", min=2, help="Maximum number of captures to use, the first ones.")
-    ] = 12,
-) -> None:
-    """Estimate the lenses of a two-lens camera from its raw pictures, for source.dual_fisheye."""
-    from pano_mvs.cli.calibrate_command import calibrate
-
-    calibrate(
-        photos,
-        to,
-        names=names,
-        layout=layout,
-        distance=distance,
-        field_of_view_deg=field_of_view,
-        up=up,
-        captures=captures,
-        console=Console(),
-    )
+app.command()(calibrate)
 
 
 @app.command("split")
@@ -592,10 +541,16 @@ def split_capture(
     ] = None,
 ) -> None:
     """Divide a capture into overlapping blocks: folders of links to its images."""
-    from pano_mvs.cli.blocks_command import split_command
-    from pano_mvs.session.merging.block_runs import Division
+    from pano_mvs.session.merging.block_runs import Division, split_images
 
-    split_command(images, to, Division(size, overlap, loop, poses), console=Console())
+    console, blocks = Console(), split_images(images, to, Division(size, overlap, loop, poses))
+    outs = [f"out/{block.folder.name}" for block in blocks]
+    for block, out in zip(blocks, outs, strict=True):
+        console.say(
+            f"{escape(str(block.folder))}: {len(block.names)} images\n"
+            f"  pano-mvs run WORKFLOW --images {escape(shlex.quote(str(block.folder)))} --out {out}"
+        )
+    console.say(f"then: pano-mvs merge {' '.join(outs)} --out out/merged")
 
 
 @app.command("merge")
@@ -640,7 +595,7 @@ def inspect_pixel(
 ) -> None:
     """Analyse one pixel: its ray, its range after each stage, and its cost for every depth hypothesis."""
     from pano_mvs.cli.inspect_command import PixelWanted, inspect
-    from pano_mvs.session.commands import reopen
+    from pano_mvs.session.session import reopen
 
     session = reopen(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)

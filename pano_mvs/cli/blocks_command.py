@@ -1,4 +1,4 @@
-"""`pano-mvs run --block-size`, `split` and `merge`: divide a capture into blocks, run them, and merge them."""
+"""`pano-mvs run --block-size` and `merge`: divide a capture into blocks, run them, and merge them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
-from pano_mvs.session.commands import run_command
-from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, Division, block_runs, divided, split_images
+from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, block_runs, divided
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.progress import Divided, Event, RunFinished
 from pano_mvs.session.running import Execution
-from pano_mvs.session.session import Session
+from pano_mvs.session.session import Session, run_command
 
 _SAME_COMMAND = "give the same command again; finished results are reused"
 
@@ -154,18 +153,6 @@ def show_blocks(
             shown = replace(run, session=replace(run.session, out=blocks / run.name), folder=blocks)
             _print_heading(shown, console=console)
             show(shown.session, console)
-
-
-def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:
-    """Write the blocks of a capture, and print them and the commands that follow."""
-    blocks = split_images(images, to, division)
-    outs = [f"out/{block.folder.name}" for block in blocks]
-    for block, out in zip(blocks, outs, strict=True):
-        console.say(
-            f"{escape(str(block.folder))}: {len(block.names)} images\n"
-            f"  pano-mvs run WORKFLOW --images {escape(shlex.quote(str(block.folder)))} --out {out}"
-        )
-    console.say(f"then: pano-mvs merge {' '.join(outs)} --out out/merged")
 
 
 def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None, console: Console) -> int:

@@ -3,42 +3,69 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Annotated, Literal
 
+import typer
 from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.console import Console
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_given
-from pano_mvs.io.images.captures import Layout
-from pano_mvs.io.rig_calibration import calibration_text
-from pano_mvs.session.calibrating import QUARTER_TURNS, calibrate_camera
-from pano_mvs.session.scaling import metres_from_text
-
-_LAYOUTS = ("auto", "side_by_side", "folders", "suffixes")
 
 
+@guarded
 def calibrate(
-    photos: Path,
-    out: Path,
+    photos: Annotated[
+        Path, typer.Argument(metavar="PHOTOS", help="Folder of the raw pictures of a two-lens camera, unstitched.")
+    ],
     *,
-    names: str,
-    layout: str,
-    distance: str,
-    field_of_view_deg: float,
-    up: str,
-    captures: int,
-    console: Console,
+    to: Annotated[Path, typer.Option("--out", metavar="FILE.yaml", help="Calibration file to write.")],
+    names: Annotated[
+        str, typer.Option("--lenses", help="Names of the lenses; in file or folder names, if they are stored apart.")
+    ] = "front,back",
+    layout: Annotated[
+        Literal["auto", "side_by_side", "folders", "suffixes"],
+        typer.Option("--layout", help="Where the pictures of the two lenses are."),
+    ] = "auto",
+    distance: Annotated[
+        str,
+        typer.Option(
+            "--distance",
+            metavar="LENGTH",
+            help="Measured distance between the centres of the lenses, such as 28mm; without it, poses are not in "
+            "metres.",
+            show_default=False,
+        ),
+    ] = "",
+    field_of_view: Annotated[
+        float,
+        typer.Option(
+            "--field-of-view",
+            min=0,
+            max=280,
+            help="Rough angle of the image circles in degrees, a start value; 0: by camera, otherwise 195.",
+        ),
+    ] = 0.0,
+    up: Annotated[
+        Literal["top", "right", "bottom", "left"],
+        typer.Option(
+            "--up", help="Side of the first lens's picture where the top of the scene is, for upright panoramas."
+        ),
+    ] = "top",
+    captures: Annotated[
+        int, typer.Option("--captures", min=2, help="Maximum number of captures to use, the first ones.")
+    ] = 12,
 ) -> None:
-    """Write the calibration of the camera that took some raw pictures."""
-    lenses = tuple(part.strip() for part in names.split(","))
+    """Estimate the lenses of a two-lens camera from its raw pictures, for source.dual_fisheye."""
+    from pano_mvs.io.rig_calibration import calibration_text
+    from pano_mvs.session.calibrating import calibrate_camera
+    from pano_mvs.session.scaling import metres_from_text
+
+    console, lenses = Console(), tuple(part.strip() for part in names.split(","))
     if len(lenses) != 2 or not all(lenses) or lenses[0] == lenses[1]:
         raise UsageError(f"--lenses {names[:80]!r}: give two different names, separated by a comma: front,back")
-    if layout not in _LAYOUTS:
-        raise UsageError(f"--layout {layout[:80]!r}: choose one of {', '.join(_LAYOUTS)}")
-    if up not in QUARTER_TURNS:
-        raise UsageError(f"--up {up[:80]!r}: choose one of {', '.join(QUARTER_TURNS)}")
     distance_m = metres_from_text(distance) if distance else None
     if distance_m is not None and distance_m > 1.0:
         raise UsageError(
@@ -47,17 +74,17 @@ def calibrate(
     rig, lines = calibrate_camera(
         photos,
         names=(lenses[0], lenses[1]),
-        layout=cast(Layout, layout),
+        layout=layout,
         distance_m=distance_m,
-        field_of_view_deg=field_of_view_deg or None,
+        field_of_view_deg=field_of_view or None,
         up=up,
         max_captures=captures,
         progress=lambda step: console.print(step, highlight=False, style="dim"),
     )
     comments = [f"estimated by pano-mvs {__version__} calibrate from {photos.name}", *lines]
-    write_given(out, calibration_text(rig, comments=comments), f"--out {out}")
+    write_given(to, calibration_text(rig, comments=comments), f"--out {to}")
     console.say("\n".join(map(escape, lines)))
     console.say(
-        f"calibration: {escape(str(out))}\nto use it: pano-mvs run quickstart --images {escape(str(photos))} "
-        f"--set images.use=source.dual_fisheye --set images.calibration={escape(str(out))}"
+        f"calibration: {escape(str(to))}\nto use it: pano-mvs run quickstart --images {escape(str(photos))} "
+        f"--set images.use=source.dual_fisheye --set images.calibration={escape(str(to))}"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from pano_mvs.evaluation.tables import finite_or_none
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
-from pano_mvs.session.commands import run_command
-from pano_mvs.session.session import Session
+from pano_mvs.session.session import Session, run_command
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.curves import curve_text
 from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
@@ -142,51 +141,28 @@ _BLOCKS = "▁█△"
 
 def as_json_value(found: Inspection) -> dict[str, Any]:
     """Return an inspection as plain JSON values; unknown values are null."""
-    curve = found.curve
-    return {
-        "image": found.image,
+    value: dict[str, Any] = _plain(found) | {
         "pixel": [found.column, found.row],
-        "size_hw": list(found.size_hw),
-        "color_rgb": list(found.color_rgb),
         "azimuth_deg": found.azimuth_deg,
         "elevation_deg": found.elevation_deg,
-        "ray_in_cam": found.ray_in_cam.tolist(),
-        "ray_in_world": found.ray_in_world.tolist(),
-        "center_in_world": found.center_in_world.tolist(),
-        "stages": [
-            {"stage": one.stage, "use": one.use, "range": finite_or_none(one.range), "confidence": one.confidence}
-            for one in found.stages
-        ],
-        "true_range": finite_or_none(found.true_range),
-        "sources": [
-            {
-                "name": one.name,
-                "baseline": one.baseline,
-                "parallax_deg": one.parallax_deg,
-                "pixel_px": list(one.pixel_px),
-                "color_rgb": list(one.color_rgb),
-                "masked": one.masked,
-                "cost": finite_or_none(one.cost),
-            }
-            for one in found.sources
-        ],
-        "sweep": found.sweep,
-        "curve": {
-            "ranges": curve.ranges.tolist(),
-            "raw": curve.raw.tolist(),
-            "aggregated": None if curve.aggregated is None else curve.aggregated.tolist(),
-            "by_source": {
-                one.name: [finite_or_none(cost) for cost in costs]
-                for one, costs in zip(found.sources, curve.by_source.tolist(), strict=True)
-            },
-            "winner": curve.winner,
-            "runner_up": curve.runner_up,
-            "range": finite_or_none(curve.range),
-            "confidence": curve.confidence,
-            "uniqueness": curve.uniqueness,
-        },
-        "notes": list(found.notes),
     }
+    costs = zip(found.sources, value["curve"]["by_source"], strict=True)
+    value["curve"]["by_source"] = {source.name: by_range for source, by_range in costs}
+    for name in ("column", "row", "settings"):
+        del value[name]
+    del value["curve"]["reason"]
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Return a record as JSON values; null in place of NaN."""
+    if is_dataclass(value):
+        return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return finite_or_none(value) if isinstance(value, float) else value
 
 
 def print_inspection(found: Inspection, console: Console) -> None:

@@ -39,22 +39,18 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
 
     The cache is `cache`, else $PANO_MVS_CACHE, else the one that run.json names. Merged runs need none.
     """
-    summary = RunSummary.read(out)
-    # Merged runs have no values in a cache: their pictures are files in the folder.
-    values = StoredValues() if summary.merged is not None else _stored_values(out, summary, cache)
+    summary, values = RunSummary.read(out), StoredValues()
+    if summary.merged is None:  # merged runs have no values in a cache: their pictures are files in the folder
+        root = cache_of(summary, cache)
+        if not is_file(root / "layout.json"):
+            raise InputError(
+                f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
+                "with --cache DIR"
+            )
+        values = StoredValues.of_folder(out, summary, Store(root, for_reading=True))
     with output_lock(out):
         write_report(out, summary, values)
     console.say(escape(f"{out / 'report.html'} is written"))
-
-
-def _stored_values(out: Path, summary: RunSummary, cache: Path | None) -> StoredValues:
-    root = cache_of(summary, cache)
-    if not is_file(root / "layout.json"):
-        raise InputError(
-            f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
-            "with --cache DIR"
-        )
-    return StoredValues.of_folder(out, summary, Store(root, for_reading=True))
 
 
 def share_output(

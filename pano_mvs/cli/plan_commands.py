@@ -11,11 +11,11 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.cli.cache.command import size_text
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_verdict
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import write_given
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
 from pano_mvs.core.yaml_text import Located
@@ -30,10 +30,9 @@ from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
 from pano_mvs.results.summary import RUN_JSON, RunSummary
-from pano_mvs.session.commands import reopen, run_command
 from pano_mvs.session.planning import RunPlan, plan_session
 from pano_mvs.session.running import Execution
-from pano_mvs.session.session import Session, check_output, presets_folder
+from pano_mvs.session.session import Session, check_output, presets_folder, reopen, run_command
 
 _SHOWN_REASONS = 5
 

@@ -81,7 +81,12 @@ def clear_abandoned(folder: Path, pattern: str = ".tmp-*") -> None:
     """
     with suppress(OSError):
         for path in children(folder, pattern):
-            if _is_abandoned(path):
+            match = _TEMPORARY.fullmatch(path.name)
+            if match and match[1] == process_place() and os.name == "posix":
+                abandoned = start_of(int(match[2])) is None  # also if it has ended but is not reaped yet
+            else:
+                abandoned = is_older(path, 7 * 24 * 3600.0)
+            if abandoned:
                 remove_whole(path)
 
 
@@ -92,13 +97,6 @@ def remove_whole(path: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _is_abandoned(path: Path) -> bool:
-    match = _TEMPORARY.fullmatch(path.name)
-    if match and match[1] == process_place() and os.name == "posix":
-        return start_of(int(match[2])) is None  # also for a process that has ended but is not reaped yet
-    return is_older(path, 7 * 24 * 3600.0)
 
 
 def is_older(path: Path, seconds: float) -> bool:

@@ -40,8 +40,12 @@ def bytes_from_size(size: str | int) -> int:
 
 
 def size_text(size_bytes: int) -> str:
-    """Return a size as text, in MB or GB."""
-    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"
+    """Return a size as text, such as 1.3 GB."""
+    size, unit = float(size_bytes), "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if size >= 1000:
+            size, unit = size / 1000, larger
+    return f"{size:.0f} B" if unit == "B" else f"{size:.1f} {unit}"
 
 
 def free_memory_bytes() -> int:

@@ -140,8 +140,11 @@ def camera_maps(
     unit = "m" if poses.metric else "scene units"
     short = [PurePosixPath(name).stem for name in names]
     labels = short if len(set(short)) == len(short) else list(names)
-    walk = _walk_of(poses.links, names)
-    links = _chosen(poses.links, names, labels, reasons=reasons or {}, walk=walk)
+    position = {name: idx for idx, name in enumerate(names)}
+    # There may be half a million of them, so only those that are drawn get words.
+    links = [link for link in poses.links if link.first in position and link.second in position]
+    walk = find_walk(len(names), [(position[link.first], position[link.second]) for link in links if link.inliers])
+    chosen = _chosen(links, position, labels, reasons=reasons or {}, walk=walk)
     north = states_z_north(poses.frame)
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
@@ -152,7 +155,7 @@ def camera_maps(
             marks=[(number, at) for (number, _), at in zip(marks, _flat(places, axes), strict=True)]
             if title == "From above"
             else (),
-            links=links,
+            links=chosen,
             walk=walk,
             doubts=doubts,
             judged=tuple(map(poses.p_right.get, names)) if poses.p_right else (),
@@ -195,19 +198,9 @@ class _Joined:
     closure: bool
 
 
-def _walk_of(links: Sequence[PairLink], names: list[str]) -> WalkPath | None:
-    position = {name: idx for idx, name in enumerate(names)}
-    pairs = [
-        (position[link.first], position[link.second])
-        for link in links
-        if link.inliers and link.first in position and link.second in position
-    ]
-    return find_walk(len(names), pairs)
-
-
 def _chosen(
     links: Sequence[PairLink],
-    names: list[str],
+    position: Mapping[str, int],
     labels: list[str],
     *,
     reasons: Mapping[tuple[str, str], str],
@@ -217,15 +210,12 @@ def _chosen(
 
     Of a walk, those that close loops come last, so that they are drawn over the others.
     """
-    position = {name: idx for idx, name in enumerate(names)}
-    # There may be half a million of them, so only those that are drawn get words.
-    found = [link for link in links if link.first in position and link.second in position]
 
     # Of the rejected links, those with the most candidates.
     def closes(link: PairLink) -> bool:
         return walk is not None and bool(link.inliers) and walk.is_closure(position[link.first], position[link.second])
 
-    found.sort(key=lambda link: (closes(link), link.inliers, -(link.candidates or 0)))
+    found = sorted(links, key=lambda link: (closes(link), link.inliers, -(link.candidates or 0)))
     split = sum(not link.inliers for link in found)
     chosen = found[:split][:600] + found[split:][-1500:]
     return [
@@ -296,7 +286,15 @@ def _drawn(
     text += f", {len(doubts)} of them doubtful" if doubts else ""
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())
     shown = tuple(cameras if named else ())
-    path = "" if walk is None else "".join(_stretch([at[idx] for idx in stretch]) for stretch in walk.stretches)
+    path = (
+        ""
+        if walk is None
+        else "".join(
+            f"M{'L'.join(f'{at[idx][0]:g} {at[idx][1]:g}' for idx in stretch)}"
+            for stretch in walk.stretches
+            if len(stretch) > 1
+        )
+    )
     ends = () if walk is None or len(labels) <= _MAX_LABELS else (at[0], at[-1])
     return CameraMap(
         title,
@@ -313,11 +311,6 @@ def _drawn(
         path,
         ends,
     )
-
-
-def _stretch(places: Sequence[tuple[float, float]]) -> str:
-    """Return the SVG path through places; empty for a single one."""
-    return f"M{'L'.join(f'{x:g} {y:g}' for x, y in places)}" if len(places) > 1 else ""
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
-from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
-from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
+from pano_mvs.report.cloud import CloudPictures, TurnableCloud, cloud_pictures, turnable_cloud
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
 from pano_mvs.report.view_cards import (
@@ -25,11 +24,11 @@ from pano_mvs.report.view_cards import (
     shares_of,
     view_cards,
 )
-from pano_mvs.results.coverage import ViewCoverage, coverage, coverage_from_fact, coverage_key, fact_of
+from pano_mvs.results.coverage import coverage, coverage_from_fact, coverage_key, fact_of
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.next_time import Suggestion, marks_of, suggestions
 from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_panels
-from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
+from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
@@ -44,20 +43,16 @@ def advice(
     summary: RunSummary, values: StoredValues, earlier: EarlierPage, *, chosen: Sequence[str]
 ) -> tuple[Suggestion, ...]:
     """Return what to do next time, the most urgent first."""
-    names = [view.name for view in summary.views]
-    return suggestions(summary, _coverage(values, earlier, names if len(names) <= 60 else chosen))
-
-
-def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) -> dict[str, ViewCoverage]:
     if not values.digest("poses"):
-        return {}
+        return suggestions(summary)
+    everything = [view.name for view in summary.views]
+    names = everything if len(everything) <= 60 else chosen
     key = coverage_key(values, names)
     fact = earlier.fact(key)
-    if fact is not None:
-        return coverage_from_fact(fact)
-    found = coverage(values, names)
-    earlier.keep(key, fact_of(found))
-    return found
+    if fact is None:
+        fact = fact_of(coverage(values, names))
+        earlier.keep(key, fact)
+    return suggestions(summary, coverage_from_fact(fact))
 
 
 # Names of folders that do not say which capture it is: the name of the folder above comes first.
@@ -298,8 +293,12 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     rows = panorama_rows(
         summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, kept=earlier)
     )
-    known = {stage: scored for stage, scored in summary.scores_by_stage.items() if not _without_truth(scored)}
-    scores = tuple((stage, score_tables(scored)) for stage, scored in known.items())
+    scores = tuple(
+        (stage, score_tables(scored))
+        for stage, scored in summary.scores_by_stage.items()
+        # else there is nothing to say but that nobody has a ground truth
+        if scored.poses or scored.views or not set(scored.notes) <= {NO_TRUTH}
+    )
     total_rows = len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected})
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
     advised = advice(judged, values, earlier, chosen=[view.name for view in chosen])
@@ -320,7 +319,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         masked=masked_areas(values, earlier),
         rows=rows,
         total_rows=total_rows,
-        mean_shares=_mean(list(shares.values())),
+        mean_shares=Shares(*np.mean([astuple(own) for own in shares.values()], axis=0).tolist()) if shares else None,
         measured_views=len(shares),
         residuals=residuals,
         pair_residuals=histogram([link.residual_deg for link in poses.links if link.residual_deg is not None]),
@@ -329,11 +328,6 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         notes=tuple(sorted(set(values.notes))),
         facts=earlier.signed_facts(),
     )
-
-
-def _without_truth(scores: ScoresSummary) -> bool:
-    """Return whether there is nothing to say but that nobody has a ground truth."""
-    return not scores.poses and not scores.views and set(scores.notes) <= {NO_TRUTH}
 
 
 def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:
@@ -364,9 +358,3 @@ def _image_width(values: StoredValues) -> int | None:
         panorama = values.panorama(name)
         return panorama.size_hw[1] if panorama is not None else None
     return None
-
-
-def _mean(shares: list[Shares]) -> Shares | None:
-    if not shares:
-        return None
-    return Shares(*(sum(column) / len(shares) for column in zip(*map(astuple, shares), strict=True)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections import Counter
-from collections.abc import Collection
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -49,6 +48,8 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
     """Write `report.html`: one file without references to others, at most 30 MB."""
     scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
+    # the files at the top of the output folder, and its folders with the number of files below
+    folders = Counter(f"{name.partition('/')[0]}/" if "/" in name else name for name in summary.files)
     # Failures, rejected pairs and the like that the page lists; run.json has all of them.
     page = (
         _environment()
@@ -56,7 +57,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
         .render(
             run=summary,
             run_notes=notes,
-            folders=_folders(summary.files),
+            folders=sorted(folders.items()),
             longest=max((stage.seconds for stage in summary.stages), default=0) or 1,
             content=content,
             most_shown=200,
@@ -100,9 +101,3 @@ def _source(script: str) -> str:
 
 def _resource(name: str) -> str:
     return (files("pano_mvs.report") / "templates" / name).read_text(encoding="utf-8")
-
-
-def _folders(names: Collection[str]) -> list[tuple[str, int]]:
-    """Return the files at the top of the output folder, and its folders with the number of files below."""
-    count = Counter(f"{name.partition('/')[0]}/" if "/" in name else name for name in names)
-    return sorted(count.items())

@@ -157,7 +157,8 @@ def chosen_views(views: Sequence[ViewSummary], *, always: Collection[str] = ()) 
     everything = list(range(len(views)))
     if len(views) <= MAX_CARDS:
         return everything
-    by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, _quality(views[idx]), idx))
+    quality = [(view.completeness or 0.0) + (view.consistent or 0.0) for view in views]
+    by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, quality[idx], idx))
     worst, rest = by_quality[: MAX_CARDS // 3], sorted(by_quality[MAX_CARDS // 3 :])
     return sorted({*worst, *evenly_spaced(rest, MAX_CARDS - len(worst))})
 
@@ -202,10 +203,6 @@ def key_of(results: StoredValues, name: str, what: str, *, version: int) -> str:
     """Return the key of an image derived from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
     return f"{digest[:24]}.{results.digest('images', name)[:16]}.{what}{version}" if digest else ""
-
-
-def _quality(view: ViewSummary) -> float:
-    return (view.completeness or 0.0) + (view.consistent or 0.0)
 
 
 def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits | None:
@@ -263,7 +260,10 @@ def _new_card(
     if range_map is not None:
         ranges, own_range = _range_pictures(range_map, stem, scales)
         pictures |= ranges
-        shares = _shares(range_map, mask)
+        kept_pixels = mask if mask is not None and mask.shape == range_map.range.shape else None
+        if range_map.sky is not None:
+            kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
+        shares = shares_of(range_map.confidence, kept_pixels)
     if stem and all(part in pictures for part in _PARTS):  # a missing image may be available for the next page
         kept.keep(stem, {"shares": astuple(shares) if shares else None, "parts": list(pictures)})
     panels = () if all(part in pictures for part in _PARTS) else preview_panels(out_dir, view.preview)
@@ -301,13 +301,6 @@ def _range_pictures(range_map: RangeMap, stem: str, scales: RangeScales) -> tupl
     differs = scales.own is not None and scales.differ
     own = _part(colored(scales.own), stem, "own_range", file="own") if differs and scales.own else None
     return pictures, own
-
-
-def _shares(range_map: RangeMap, mask: NDArray[np.bool_] | None) -> Shares:
-    kept_pixels = mask if mask is not None and mask.shape == range_map.range.shape else None
-    if range_map.sky is not None:
-        kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
-    return shares_of(range_map.confidence, kept_pixels)
 
 
 def _part(image: NDArray[np.uint8], stem: str, part: str, *, file: str = "") -> Picture:

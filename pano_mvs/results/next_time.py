@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -73,6 +73,12 @@ class CameraGroup:
         known = self.coverage.get(self.names[idx])
         return None if known is None else known.typical_range
 
+    def between(self, pair: tuple[int, int], severity: _Severity, text: str, *, count: int = 1) -> _Reason:
+        """Return a reason to take panoramas in the middle between two cameras."""
+        x, y, z = (float(value) for value in self.centers[list(pair)].mean(axis=0))
+        names = self.names[pair[0]], self.names[pair[1]]
+        return _Reason(severity, text, names, group=self.number, at=(x, y, z), count=count)
+
 
 def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
     """Return (first, second, length) of the edges of the minimum spanning tree of points (N, 3), by Prim's method."""
@@ -117,82 +123,51 @@ class Suggestion:
     at: Direction | None = None  # where to stand; None if no place is known
 
 
-@dataclass
-class _Between:
+@dataclass(frozen=True)
+class _Reason:
+    """A reason to take panoramas between two images, or else for an action."""
+
     severity: _Severity
-    group: int
-    at: Direction | None
-    reasons: list[str] = field(default_factory=list)
-    count: int = 1
+    text: str
+    between: tuple[str, str] | None = None
+    action: str = ""
+    group: int = 0
+    at: Direction | None = None
+    count: int = 1  # of panoramas between the two
 
 
 def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None = None) -> tuple[Suggestion, ...]:
     """Return what to do when the place is captured again, the most urgent first.
 
+    Reasons for the same two images become one suggestion.
+
     Args:
         coverage: what the views see, as far as known; see `pano_mvs.results.coverage`.
     """
-    found = _Collected()
-    parts = summary.poses.by_group()
-    _connect_groups(summary, found)
-    _register(summary, found)
-    for number, poses in enumerate(parts):
+    reasons = [*_connect_groups(summary), *_register(summary)]
+    for number, poses in enumerate(summary.poses.by_group()):
         group = CameraGroup.of(number, poses, coverage or {})
-        if group is None:
-            continue
-        _spacing(group, found)
-        for idx, name in enumerate(group.names):
-            if name in group.poses.doubts:
-                reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
-                _stand_between(
-                    group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason
-                )
-        _weak(group, summary, found)
-        _loose(group, found)
-        _lonely(group, found)
-    return found.in_order()
+        if group is not None:
+            found = _spacing(group), _doubtful(group), _weak(group, summary), _loose(group), _lonely(group)
+            reasons += [reason for some in found for reason in some]
+    together: dict[object, list[_Reason]] = {}
+    for idx, reason in enumerate(reasons):
+        together.setdefault(tuple(sorted(reason.between)) if reason.between else idx, []).append(reason)
+    ranked = []
+    for several in together.values():
+        first = several[0]
+        action = first.action
+        if first.between is not None:
+            count = max(reason.count for reason in several)
+            what = "a panorama" if count == 1 else f"{count} panoramas"
+            action = f"Take {what} between {' and '.join(sorted(first.between))}."
+        place = Suggestion(action, tuple(reason.text for reason in several), first.group, first.at)
+        ranked.append((min(reason.severity for reason in several), -len(several), first.between is None, place))
+    ranked.sort(key=lambda entry: entry[:3])
+    return tuple(suggestion for *_, suggestion in ranked)
 
 
-class _Collected:
-    """Suggestions; those for the same two images become one with several reasons."""
-
-    def __init__(self) -> None:
-        self._between: dict[tuple[str, str], _Between] = {}
-        self._others: list[tuple[_Severity, Suggestion]] = []
-
-    def between(
-        self,
-        pair: tuple[str, str],
-        severity: _Severity,
-        reason: str,
-        *,
-        group: int = 0,
-        at: Direction | None = None,
-        count: int = 1,
-    ) -> None:
-        """Add a reason to take panoramas between two images."""
-        first, second = sorted(pair)
-        entry = self._between.setdefault((first, second), _Between(severity, group, at))
-        entry.severity = min(entry.severity, severity)
-        entry.count = max(entry.count, count)
-        entry.reasons.append(reason)
-
-    def add(self, severity: _Severity, suggestion: Suggestion) -> None:
-        self._others.append((severity, suggestion))
-
-    def in_order(self) -> tuple[Suggestion, ...]:
-        """Return all suggestions, the most urgent first."""
-        ranked: list[tuple[_Severity, Suggestion]] = []
-        for (first, second), entry in self._between.items():
-            what = "a panorama" if entry.count == 1 else f"{entry.count} panoramas"
-            action = f"Take {what} between {first} and {second}."
-            ranked.append((entry.severity, Suggestion(action, tuple(entry.reasons), entry.group, entry.at)))
-        ranked += self._others
-        ranked.sort(key=lambda pair: (pair[0], -len(pair[1].reasons)))
-        return tuple(suggestion for _, suggestion in ranked)
-
-
-def _connect_groups(summary: RunSummary, found: _Collected) -> None:
+def _connect_groups(summary: RunSummary) -> Iterator[_Reason]:
     """Suggest panoramas between groups that no reliable pair connects."""
     for number, group in enumerate(summary.poses.groups[1:], start=1):
         size = f"group {number} ({len(group.images)} {plural(len(group.images), 'panorama')})"
@@ -202,31 +177,34 @@ def _connect_groups(summary: RunSummary, found: _Collected) -> None:
                 f"{size} has no reliable connection to the largest group; of all pairs across, this one has the most "
                 f"in common: {_matches(pair.matches, pair.candidates)}"
             )
-            found.between((pair.first, pair.second), _Severity.APART, reason)
+            yield _Reason(_Severity.APART, reason, (pair.first, pair.second))
             continue
         largest = summary.poses.groups[0].images
         action = f"Take panoramas on the way from {shortened_list(largest, 2)} to {shortened_list(group.images, 2)}."
         reason = f"{size} has no reliable connection to the largest group, and no pair across was compared"
-        found.add(_Severity.APART, Suggestion(action, (reason,)))
+        yield _Reason(_Severity.APART, reason, action=action)
 
 
-def _register(summary: RunSummary, found: _Collected) -> None:
+def _register(summary: RunSummary) -> Iterator[_Reason]:
     """Suggest panoramas between images without a pose and the registered ones with which they share most."""
     poses = summary.poses
     best = _best_partners(poses)
-    left_out = [name for name in poses.rejected if not _unreadable(summary, name)]
+    # Those that the source left out, as not being panoramas, for example, need no others beside them.
+    sources = {stage.name for stage in summary.stages if stage.use.startswith("source.")}
+    unreadable = {name for name, rejection in summary.rejected.items() if rejection.stage in sources}
+    left_out = [name for name in poses.rejected if name not in unreadable]
     with_partner = sorted((name for name in left_out if name in best), key=lambda name: _strength(best[name]))[::-1]
     for name in with_partner[:_MAX_UNREGISTERED]:
         link = best[name]
         partner = link.second if link.first == name else link.first
         reason = f"the image {name} has no pose; this pair has {_matches(link.inliers, link.candidates)}"
-        found.between((name, partner), _Severity.UNREGISTERED, reason)
+        yield _Reason(_Severity.UNREGISTERED, reason, (name, partner))
     rest = [name for name in left_out if name not in with_partner[:_MAX_UNREGISTERED]]
     if rest:
         count = f"{len(rest)} {'more ' if len(rest) < len(left_out) else ''}{plural(len(rest), 'panorama')}"
         action = f"Take panoramas 0.5–1 m apart on the way to {shortened_list(rest)}."
         reason = f"{count} of {len(poses.registered) + len(poses.rejected)} {plural(len(rest), 'has', 'have')} no pose"
-        found.add(_Severity.UNREGISTERED, Suggestion(action, (reason,)))
+        yield _Reason(_Severity.UNREGISTERED, reason, action=action)
 
 
 def _best_partners(poses: PosesSummary) -> dict[str, PairLink]:
@@ -244,18 +222,12 @@ def _strength(link: PairLink) -> tuple[int, int]:
     return link.inliers, link.candidates or 0
 
 
-def _unreadable(summary: RunSummary, name: str) -> bool:
-    """Return whether an image was left out by its source, as not being a panorama, for example."""
-    sources = {stage.name for stage in summary.stages if stage.use.startswith("source.")}
-    return name in summary.rejected and summary.rejected[name].stage in sources
-
-
 def _matches(inliers: int, candidates: int | None) -> str:
     verified = f"{inliers} verified {plural(inliers, 'match', 'matches')}"
     return verified if candidates is None else f"{verified} of {candidates} {plural(candidates, 'candidate')}"
 
 
-def _spacing(group: CameraGroup, found: _Collected) -> None:
+def _spacing(group: CameraGroup) -> Iterator[_Reason]:
     """Suggest panoramas in gaps, and other distances if neighbours are too close."""
     edges = shortest_tree(group.centers)
     typical = median([length for _, _, length in edges]) or 0.0
@@ -269,7 +241,7 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
                 f"{group.length(typical)}"
             )
             count = min(20, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
-            _stand_between(group, found, (first, second), severity=_Severity.SPACING, reason=reason, count=count)
+            yield group.between((first, second), _Severity.SPACING, reason, count=count)
     for idx, name in enumerate(group.names):
         known = group.typical_range(idx)
         other = int(group.nearest(idx)[0])
@@ -278,17 +250,11 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
                 f"{name} is {group.length(distance)} from its nearest neighbour, {share(distance / known)} of the "
                 f"median distance to what it sees ({group.length(known)}): near surfaces look too different"
             )
-            _stand_between(group, found, (idx, other), severity=_Severity.SPACING, reason=reason)
-    _all_too_close(group, found)
+            yield group.between((idx, other), _Severity.SPACING, reason)
+    yield from _all_too_close(group)
 
 
-def _too_close(group: CameraGroup, first: int, second: int) -> bool:
-    """Return whether a panorama between two cameras would be too close to both to be of use."""
-    known = group.typical_range(first)
-    return known is not None and group.distance(first, second) < SHORT_BASELINE * known
-
-
-def _all_too_close(group: CameraGroup, found: _Collected) -> None:
+def _all_too_close(group: CameraGroup) -> Iterator[_Reason]:
     """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
     known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
     farthest = {idx: group.distance(idx, int(group.nearest(idx)[:4][-1])) for idx in known}
@@ -305,12 +271,19 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
         f"{share(SHORT_BASELINE)} of the median distance to what they see, so that ranges are uncertain; "
         f"{group.names[worst]}, for example, within {group.length(farthest[worst])}, {share(ratios[worst])}"
     )
-    found.add(
-        _Severity.SPACING, Suggestion(f"Take panoramas {low}–{high} {group.unit} apart.", (reason,), group.number)
-    )
+    action = f"Take panoramas {low}–{high} {group.unit} apart."
+    yield _Reason(_Severity.SPACING, reason, action=action, group=group.number)
 
 
-def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:
+def _doubtful(group: CameraGroup) -> Iterator[_Reason]:
+    """Suggest panoramas beside cameras whose poses are doubtful."""
+    for idx, name in enumerate(group.names):
+        if name in group.poses.doubts:
+            reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
+            yield group.between((idx, int(group.nearest(idx)[0])), _Severity.DOUBTFUL, reason)
+
+
+def _weak(group: CameraGroup, summary: RunSummary) -> Iterator[_Reason]:
     """Suggest panoramas beside cameras of whose pixels other views confirm much less than usual."""
     shares = {view.name: view.consistent for view in summary.views if view.consistent is not None}
     usual = median(list(shares.values()))
@@ -319,12 +292,15 @@ def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:
     limit = max(FAIR_CONSISTENT, _WEAK * usual)
     for idx, name in enumerate(group.names):
         other = int(group.nearest(idx)[0])
-        if shares.get(name, 1.0) < limit and not _too_close(group, idx, other):
+        known = group.typical_range(idx)
+        # A panorama between two cameras that are too close would be of no use.
+        is_close = known is not None and group.distance(idx, other) < SHORT_BASELINE * known
+        if shares.get(name, 1.0) < limit and not is_close:
             reason = f"other views confirm {share(shares[name])} of {name}, and {share(usual)} of the median view"
-            _stand_between(group, found, (idx, other), severity=_Severity.WEAK, reason=reason)
+            yield group.between((idx, other), _Severity.WEAK, reason)
 
 
-def _loose(group: CameraGroup, found: _Collected) -> None:
+def _loose(group: CameraGroup) -> Iterator[_Reason]:
     """Suggest panoramas beside cameras that share a verified geometry with only one other."""
     links = [link for link in group.poses.links if link.inliers]
     if len(group.names) < MIN_CAMERAS or not links:
@@ -340,10 +316,10 @@ def _loose(group: CameraGroup, found: _Collected) -> None:
         reason = (
             f"one panorama alone, {partner}, shares a verified geometry with {name} ({_matches(link.inliers, None)})"
         )
-        _stand_between(group, found, (idx, others[0]), severity=_Severity.LOOSE, reason=reason)
+        yield group.between((idx, others[0]), _Severity.LOOSE, reason)
 
 
-def _lonely(group: CameraGroup, found: _Collected) -> None:
+def _lonely(group: CameraGroup) -> Iterator[_Reason]:
     """Suggest panoramas towards the largest areas that one camera alone sees."""
     areas = [
         (area, idx)
@@ -360,7 +336,7 @@ def _lonely(group: CameraGroup, found: _Collected) -> None:
         )
         x, y, z = (float(value) for value in (group.centers[idx] + np.array(area.at)) / 2)
         action = f"Take a panorama half-way from {name} to what it sees {where}."
-        found.add(_Severity.LONELY, Suggestion(action, (reason,), group.number, (x, y, z)))
+        yield _Reason(_Severity.LONELY, reason, action=action, group=group.number, at=(x, y, z))
 
 
 def direction_words(area: LonelyArea) -> str:
@@ -378,20 +354,6 @@ def direction_words(area: LonelyArea) -> str:
     if abs(elevation) < 5:
         return across
     return f"{across}, {abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
-
-
-def _stand_between(
-    group: CameraGroup,
-    found: _Collected,
-    pair: tuple[int, int],
-    *,
-    severity: _Severity,
-    reason: str,
-    count: int = 1,
-) -> None:
-    x, y, z = (float(value) for value in group.centers[list(pair)].mean(axis=0))
-    names = group.names[pair[0]], group.names[pair[1]]
-    found.between(names, severity, reason, group=group.number, at=(x, y, z), count=count)
 
 
 def marks_of(found: Iterable[Suggestion], group: int) -> list[tuple[int, Direction]]:

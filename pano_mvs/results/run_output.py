@@ -64,7 +64,10 @@ class RunOutput:
             InputError: if they cannot be read, or files cannot be named after one of the images.
         """
         poses = self.values.poses
-        if poses is None and is_folder(self.out / "colmap") and not self._has_old_model():
+        is_old, is_own = (
+            any(name.startswith("colmap/") for name in of) for of in (self.summary.left_over, self.summary.files)
+        )
+        if poses is None and is_folder(self.out / "colmap") and not (is_old and not is_own):
             groups = read_groups(self.out)
             poses = join_groups(groups) if len(groups) > 1 else groups[0]
         # Names in a COLMAP model have not passed the checks of a source.
@@ -103,11 +106,6 @@ class RunOutput:
             name: path relative to the output folder.
         """
         return name not in self.summary.left_over and file_inside(self.out, name) is not None
-
-    def _has_old_model(self) -> bool:
-        """Return whether the COLMAP model is left over from an earlier run."""
-        models = [any(name.startswith("colmap/") for name in of) for of in (self.summary.left_over, self.summary.files)]
-        return models == [True, False]
 
     def __repr__(self) -> str:
         """Return the folder, the workflow, and how the run ended."""

@@ -42,13 +42,7 @@ def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_wi
         outcome = f"Finished, with {' and '.join(text for text, found in parts.items() if found) or 'failed items'}"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
-    tiles = [
-        *_registered(summary),
-        *_residual(residual_deg, residual_px),
-        *_coverage(summary),
-        *_cloud(summary),
-        *_accuracy(summary),
-    ]
+    tiles = list(_tiles(summary, residual_deg, residual_px))
     found = findings(summary, residual_px=residual_px)
     moods = {mood, *(tile.mood for tile in tiles), *(finding.mood for finding in found)}
     overall = _worst(moods)
@@ -79,57 +73,35 @@ def _sentence(summary: RunSummary) -> str:
     return f"{figure(total)} {plural(total, 'unit of work', 'units of work')}: {', '.join(parts)}."
 
 
-def _registered(summary: RunSummary) -> list[Tile]:
-    poses = summary.poses
+def _tiles(summary: RunSummary, residual_deg: float | None, residual_px: float | None) -> Iterator[Tile]:
+    poses, points, scores = summary.poses, summary.cloud.points, summary.scores
     registered, rejected = len(poses.registered), len(poses.rejected)
-    if not registered + rejected:
-        return []
-    moods = {mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED), doubt_mood(poses)}
-    groups, doubts = len(poses.groups), len(poses.doubts)
-    label = "panoramas registered" + (f", in {groups} groups" if groups > 1 else "")
-    label += f", {doubts} doubtful" if doubts else ""
-    return [Tile(f"{registered} of {registered + rejected}", label, _worst(moods))]
-
-
-def _residual(residual_deg: float | None, residual_px: float | None) -> list[Tile]:
-    if residual_deg is None:
-        return []
-    mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
-    pixels = f", {significant(residual_px)} px" if residual_px is not None else ""
-    return [Tile(degrees(residual_deg), f"median reprojection residual{pixels}", mood)]
-
-
-def _coverage(summary: RunSummary) -> list[Tile]:
-    tiles = []
+    if registered + rejected:
+        moods = {mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED), doubt_mood(poses)}
+        groups, doubts = len(poses.groups), len(poses.doubts)
+        label = "panoramas registered" + (f", in {groups} groups" if groups > 1 else "")
+        label += f", {doubts} doubtful" if doubts else ""
+        yield Tile(f"{registered} of {registered + rejected}", label, _worst(moods))
+    if residual_deg is not None:
+        mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
+        pixels = f", {significant(residual_px)} px" if residual_px is not None else ""
+        yield Tile(degrees(residual_deg), f"median reprojection residual{pixels}", mood)
     for key, label, limits in (
         ("completeness", "of pixels have a range", (GOOD_COMPLETE, FAIR_COMPLETE)),
         ("consistent", "of pixels agree with other views", (GOOD_CONSISTENT, FAIR_CONSISTENT)),
     ):
         value = median([getattr(view, key) for view in summary.views])
         if value is not None and (key != "consistent" or compares_views(summary)):
-            tiles.append(Tile(share(value), label, mood_of(value, *limits)))
-    return tiles
-
-
-def _cloud(summary: RunSummary) -> list[Tile]:
-    points = summary.cloud.points
-    if points is None:
-        return []
-    text = f"{points / 1e6:.2f} M" if points >= 1_000_000 else figure(points)
-    return [Tile(text, f"{plural(points, 'point')} in the cloud", "" if points else "bad")]
-
-
-def _accuracy(summary: RunSummary) -> list[Tile]:
-    scores = summary.scores
-    tiles = []
+            yield Tile(share(value), label, mood_of(value, *limits))
+    if points is not None:
+        text = f"{points / 1e6:.2f} M" if points >= 1_000_000 else figure(points)
+        yield Tile(text, f"{plural(points, 'point')} in the cloud", "" if points else "bad")
     error_deg = median([scores.poses.get("median_pair_error_deg")])
     if error_deg is not None:
-        tiles.append(Tile(degrees(error_deg), "median pose error against the ground truth"))
-    errors = [view.get("median_relative_error") for view in scores.views.values()]
-    relative = median(errors)
+        yield Tile(degrees(error_deg), "median pose error against the ground truth")
+    relative = median([view.get("median_relative_error") for view in scores.views.values()])
     if relative is not None:
-        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the ground truth"))
-    return tiles
+        yield Tile(f"{significant(100 * relative)} %", "median range error against the ground truth")
 
 
 GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
@@ -139,10 +111,6 @@ GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
 GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 # No other view confirms walls without texture: a third of the pixels of a furnished room is a good share.
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
-# A ceiling or floor of which other views confirm less than this is reported, because its ranges may be far off.
-FAIR_CONFIRMED_SIDE = 0.15
-# A model is bad if more than half of its cameras are doubtful.
-FAIR_UNDOUBTED = 0.5
 
 
 def mood_of(value: float, good: float, fair: float) -> str:
@@ -178,8 +146,7 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
         *_graph(summary),
         *_imprecision(residual_px),
         *_views(summary),
-        *_sides(summary),
-        *_empty_cloud(summary),
+        *_cloud(summary),
         *_baseline(summary),
     ]
     return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
@@ -204,7 +171,8 @@ def _failures(summary: RunSummary) -> Iterator[Finding]:
         return
     stages = Counter(failure.stage for failure in failures)
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
-    more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
+    further = f"{figure(len(blocked))} further {plural(len(blocked), 'unit')}"
+    more = f"; {further} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
     verb = plural(len(failures), "unit of work failed", "units of work failed")
     yield Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
 
@@ -228,7 +196,7 @@ def _registration(summary: RunSummary) -> Iterator[Finding]:
 
 def doubt_mood(poses: PosesSummary) -> str:
     """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
-    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
+    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, 0.5)
 
 
 def _doubts(summary: RunSummary) -> Iterator[Finding]:
@@ -256,7 +224,10 @@ def _groups(summary: RunSummary) -> Iterator[Finding]:
     groups = summary.poses.groups
     if len(groups) < 2:
         return
-    sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
+    sizes = [
+        f"group {number} has {len(group.images)} ({shortened_list(group.images, rest=' …')})"
+        for number, group in enumerate(groups[1:], start=1)
+    ]
     more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
     largest = len(groups[0].images)
     text = (
@@ -265,11 +236,6 @@ def _groups(summary: RunSummary) -> Iterator[Finding]:
         f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}. They may also be different places."
     )
     yield Finding("fair", text, pictures_between(groups))
-
-
-def _named(group: PoseGroup) -> str:
-    names = group.images
-    return f"{len(names)} ({shortened_list(names, rest=' …')})"
 
 
 def pictures_between(groups: Sequence[PoseGroup]) -> str:
@@ -355,13 +321,11 @@ def _views(summary: RunSummary) -> Iterator[Finding]:
             "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
             "far apart or the poses are wrong.",
         )
-
-
-def _sides(summary: RunSummary) -> Iterator[Finding]:
-    """Yield a finding if most ranges above or below the cameras are unconfirmed, in half of the views."""
+    # Most ranges above or below the cameras may be unconfirmed, in half of the views.
     for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
         confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
-        if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
+        # With less than this, ranges of a ceiling or floor may be far off.
+        if confirmed is not None and confirmed < 0.15:
             yield Finding(
                 "fair",
                 f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
@@ -371,7 +335,7 @@ def _sides(summary: RunSummary) -> Iterator[Finding]:
             )
 
 
-def _empty_cloud(summary: RunSummary) -> Iterator[Finding]:
+def _cloud(summary: RunSummary) -> Iterator[Finding]:
     if summary.cloud.points == 0:
         yield Finding(
             "bad",
@@ -389,7 +353,3 @@ def _baseline(summary: RunSummary) -> Iterator[Finding]:
         if ours is not None and constant is not None and ours <= constant:
             text = f"Compared with the ground truth ({stage}), a single constant range scores at least as well"
             yield Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB.")
-
-
-def _units(count: int) -> str:
-    return f"{figure(count)} further {plural(count, 'unit')}"

@@ -16,7 +16,7 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
 from pano_mvs.engine.executors.choose import shape
-from pano_mvs.engine.planning.forecast import StageForecast, forecast, makespan
+from pano_mvs.engine.planning.forecast import Experience, StageForecast, forecast, makespan
 from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import WHOLE, Unit
@@ -137,9 +137,9 @@ def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> Run
     with suppress(StoreError):  # a cache of other users can be read, not written
         store.stat_cache.save()
     workers, threads = shape(workers, threads)
-    size, histories = listing.size(), (store.unit_times,)
-    forecasts = forecast(plans, workflow, graph, size=size, histories=histories, threads=threads)
-    return RunPlan(tuple(plans), forecasts, workers, expected_report_s(forecasts, size, histories))
+    experience = Experience(listing.size(), (store.unit_times,), threads)
+    forecasts = forecast(plans, workflow, graph, experience=experience)
+    return RunPlan(tuple(plans), forecasts, workers, expected_report_s(forecasts, experience))
 
 
 @contextmanager
@@ -175,20 +175,20 @@ def forecast_run(run: Run) -> Forecast | None:
         plans = _without_cache(run)
     except PanoMvsError:
         return None  # the run reports the error
-    size, histories = run.listing.size(), (run.store.unit_times, reference_times())
-    stages = forecast(plans, run.workflow, run.graph, size=size, histories=histories, threads=run.executor.threads)
-    return Forecast(stages, expected_report_s(stages, size, histories))
+    experience = Experience(run.listing.size(), (run.store.unit_times, reference_times()), run.executor.threads)
+    stages = forecast(plans, run.workflow, run.graph, experience=experience)
+    return Forecast(stages, expected_report_s(stages, experience))
 
 
-def expected_report_s(stages: Sequence[StageForecast], size: CaptureSize, histories: Sequence[UnitTimes]) -> float:
+def expected_report_s(stages: Sequence[StageForecast], experience: Experience) -> float:
     """Return the expected time for the report of a run; 0 if it is unknown, or nothing is computed."""
     if all(stage.units == 0 for stage in stages):
         return 0.0
-    images = CaptureSize(size.images, pixels=1.0)  # the pictures in the report are small, whatever the images are
-    found = (
-        history.expected_unit(_REPORT, images, settings=_NO_SETTINGS, threads=1, whole=True) for history in histories
+    size = CaptureSize(experience.size.images, pixels=1.0)  # its pictures are small, whatever the images are
+    report = experience.first(
+        lambda times: times.expected_unit(_REPORT, size, settings=_NO_SETTINGS, threads=1, whole=True)
     )
-    return next((report.seconds for report in found if report is not None), 0.0)
+    return 0.0 if report is None else report.seconds
 
 
 def remember_report(run: Run, seconds: float) -> None:

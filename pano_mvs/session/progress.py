@@ -25,41 +25,14 @@ from pydantic import TypeAdapter, ValidationError
 from pano_mvs.core.text import json_without_controls
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.dispatcher import LOG_FOLDER
-from pano_mvs.engine.running.events import (
-    RunEvent,
-    StageFinished,
-    StageStarted,
-    UnitFailed,
-    UnitFinished,
-    UnitStarted,
-    Warned,
-)
+from pano_mvs.engine.running.events import RunEvent
+from pano_mvs.engine.running.events import StageFinished as StageFinished  # these are passed on
+from pano_mvs.engine.running.events import StageStarted as StageStarted
+from pano_mvs.engine.running.events import UnitFailed as UnitFailed
+from pano_mvs.engine.running.events import UnitFinished as UnitFinished
+from pano_mvs.engine.running.events import UnitStarted as UnitStarted
+from pano_mvs.engine.running.events import Warned as Warned
 from pano_mvs.results.records import Verdict
-
-__all__ = [
-    "EVENTS_FILE",
-    "SCHEMA",
-    "BlockStarted",
-    "Divided",
-    "Event",
-    "EventLog",
-    "EventReader",
-    "Forecast",
-    "KernelsCompiled",
-    "Progress",
-    "RunFinished",
-    "RunStarted",
-    "StageFinished",
-    "StageStarted",
-    "TimeLeft",
-    "UnitFailed",
-    "UnitFinished",
-    "UnitStarted",
-    "Warned",
-    "WorkersChanged",
-    "event_from_line",
-    "line_from_event",
-]
 
 
 @dataclass(frozen=True, slots=True)

@@ -126,7 +126,13 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
             if (forecast := forecast_run(run)) is not None:
                 observer(forecast)
             summary, values = _execute(run, started, clock)
-        end = _finished(summary, end)
+        end = replace(
+            _counted(run, end),
+            exit_code=summary.exit_code,
+            stopped=summary.stopped,
+            verdict=summary.verdict,
+            doubts=dict(summary.doubtful_images),
+        )
         return RunOutput(session.out, summary, values, written=tuple(run.result.written))
     except PanoMvsError as error:
         end = replace(_counted(run, end), exit_code=error.exit_code, stopped=str(error))
@@ -160,23 +166,8 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
             run.observer(Warned(str(error)))
 
 
-def _finished(summary: RunSummary, end: RunFinished) -> RunFinished:
-    units = summary.units
-    return replace(
-        end,
-        exit_code=summary.exit_code,
-        stopped=summary.stopped,
-        run=units.run,
-        cached=units.cached,
-        failed=units.failed,
-        blocked=units.blocked,
-        verdict=summary.verdict,
-        doubts=dict(summary.doubtful_images),
-    )
-
-
 def _counted(run: Run | None, end: RunFinished) -> RunFinished:
-    """Return the event with the units of a run that did not finish."""
+    """Return the event with the units of a run."""
     stages = run.result.stages if run is not None else []
     names = ("run", "cached", "failed", "blocked")
     return replace(end, **{name: sum(getattr(stage, name) for stage in stages) for name in names})

@@ -274,7 +274,7 @@ class _Rewiring:
         settings: dict[str, Any] = {"factor": self.known.factor, "group": self.known.group}
         if kind is Poses:
             settings["origin"] = self.known.origin
-            inputs["images"] = self._images()
+            inputs["images"] = [n for n in self.graph.order if issubclass(self.stages[n].spec.output, Panorama)][-1]
         elif kind is RangeMap:
             inputs["pose"] = self.poses
         name = f"{_PREFIX}{maker}"
@@ -282,10 +282,6 @@ class _Rewiring:
         policy = Policy.model_validate({"use": use, "in": inputs})
         self.added[name] = StageEntry(name, spec, spec.params_type.model_validate(settings), policy, WORKFLOW_FILE)
         return name
-
-    def _images(self) -> str:
-        found = [name for name in self.graph.order if issubclass(self.stages[name].spec.output, Panorama)]
-        return found[-1]
 
 
 def _camera(groups: list[Poses], text: str) -> tuple[int, str]:

@@ -41,7 +41,8 @@ class Spans:
         self._endpoint = _endpoint()
         self._trace = _import("opentelemetry.trace")
         try:
-            self._exporter = exporter or _exporter(self._endpoint)
+            http = "opentelemetry.exporter.otlp.proto.http.trace_exporter"
+            self._exporter = exporter or _import(http).OTLPSpanExporter(self._endpoint)
             self._provider = _provider(self._exporter)
         except PanoMvsError:
             raise
@@ -182,10 +183,6 @@ def _endpoint() -> str:
     """Return the address to which spans are sent, by the standard environment variables."""
     base = os.environ.get("OTEL_EXPORTER_OTLP_ENDPOINT") or "http://localhost:4318"
     return os.environ.get("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT") or f"{base.rstrip('/')}/v1/traces"
-
-
-def _exporter(endpoint: str) -> Any:
-    return _import("opentelemetry.exporter.otlp.proto.http.trace_exporter").OTLPSpanExporter(endpoint)
 
 
 def _provider(exporter: Any) -> Any:

@@ -19,7 +19,7 @@ from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
 from pano_mvs.core.extras import installed_version
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.running.events import Failure, StageSummary
+from pano_mvs.engine.running.events import StageSummary
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
@@ -84,7 +84,11 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
             blocked=sum(stage.blocked for stage in result.stages),
         ),
         stages=tuple(_stage(summary, workflow) for summary in result.stages),
-        failures=tuple(_failed(failure) for failure in result.failures if not failure.blocked),
+        failures=tuple(
+            FailedUnit(**{name: getattr(failure, name) for name in FailedUnit.model_fields})
+            for failure in result.failures
+            if not failure.blocked
+        ),
         blocked=blocked,
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
@@ -97,7 +101,12 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         views=_views(run, results.get("ranges", "")),
         cloud=_cloud(run),
         workflow_text=workflow.text,
-        versions=_versions(),
+        versions={
+            "python": platform.python_version(),
+            "pano_mvs": pano_mvs.__version__,
+            "system": platform.platform(),
+            **{name: installed_version(name) or "not installed" for name in _LIBRARIES},
+        },
         files=dict(sorted(result.published.items())),
         left_over=dict(sorted(result.left_over.items())),
         inputs=run.listing.digests(),
@@ -114,11 +123,6 @@ def _stage(summary: StageSummary, workflow: Workflow) -> StageOutcome:
         seconds=round(summary.seconds, 3),
         unit_seconds=round(summary.unit_seconds, 3),
     )
-
-
-def _failed(failure: Failure) -> FailedUnit:
-    names = ("stage", "item", "cause", "consequence", "trace", "log")
-    return FailedUnit(**{name: getattr(failure, name) for name in names})
 
 
 def _reasons(found: Mapping[str, tuple[str, str]]) -> dict[str, ImageReason]:
@@ -328,11 +332,6 @@ def _machine() -> dict[str, Any]:
     with suppress(AttributeError, ValueError, OSError):  # not on every system
         found["memory_gb"] = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     return found
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version(), "pano_mvs": pano_mvs.__version__, "system": platform.platform()}
-    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 PLAUSIBLE_HEIGHT_M = 1.6  # a usual height of a camera on a tripod or a stick

@@ -165,7 +165,10 @@ class TimeEstimator:
                 self.stages[event.stage] = StageProgress(self._of(event.stage).forecast, event.units)
             case UnitStarted():
                 self._of(event.stage).start(event.item, self._clock())
-                self._note_running()
+                # Memory may permit fewer units at a time than there are workers.
+                running = sum(len(stage.running) for stage in self.stages.values())
+                for stage in self.stages.values():
+                    stage.most_at_once = max(stage.most_at_once, running if stage.running else 0)
             case UnitFinished():
                 stage = self._of(event.stage)
                 stage.end(event.item, self._clock())
@@ -204,13 +207,6 @@ class TimeEstimator:
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))
-
-    def _note_running(self) -> None:
-        """Record how many units run at a time: memory may permit fewer than there are workers."""
-        running = sum(len(stage.running) for stage in self.stages.values())
-        for stage in self.stages.values():
-            if stage.running:
-                stage.most_at_once = max(stage.most_at_once, running)
 
     def _at_a_time(self, name: str) -> int:
         stage = self.stages[name]

@@ -315,7 +315,7 @@ def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cach
 
     It does so three times for each file, and then takes the disk to be damaged, so there are three collections.
     """
-    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.02)'))
+    toy.begin("time.sleep(0.02)")
     toy.run(cache=toy.folder / "clean")
     clean = deliverables(toy.folder / "out")
     results: list[tuple[int, str]] = []

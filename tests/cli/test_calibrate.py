@@ -28,8 +28,8 @@ def write_pictures(folder: Path, count: int, value: int = 90, *, size_hw: tuple[
     ("options", "message"),
     [
         (["--lenses", "front"], "two different names, separated by a comma"),
-        (["--layout", "stacked"], "choose one of auto, side_by_side, folders, suffixes"),
-        (["--up", "down"], "choose one of top, right, bottom, left"),
+        (["--layout", "stacked"], "is not one of 'auto', 'side_by_side', 'folders', 'suffixes'"),
+        (["--up", "down"], "is not one of 'top', 'right', 'bottom', 'left'"),
         (["--distance", "28"], "28 m is too far for the lenses of one camera. Add a unit: 28mm"),
         (["--distance", "near"], "is not a length"),
     ],

@@ -42,7 +42,7 @@ def test_too_small_an_address_space_is_refused(monkeypatch: pytest.MonkeyPatch) 
     limit = 2 * 10**9
     require_address_space()
     limit = 300_000_000
-    with pytest.raises(RunStoppedError, match=r"at most 300 MB of address space \(`ulimit -v`\)"):
+    with pytest.raises(RunStoppedError, match=r"at most 300.0 MB of address space \(`ulimit -v`\)"):
         require_address_space()
 
 

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,6 +62,11 @@ class Toy:
     def edit(self, name: str, change: Callable[[str], str]) -> None:
         path = self.folder / name
         path.write_text(change(path.read_text()))
+
+    def begin(self, code: str, *, of: str = "Multiply.") -> None:
+        """Let a stage, by default the one that multiplies, begin with some code; `of` is its docstring."""
+        mark = f'    """{of}"""\n'
+        self.edit("plug.py", lambda text: text.replace(mark, f"{mark}{textwrap.indent(code.strip(), '    ')}\n"))
 
     def deliverables(self) -> dict[str, bytes]:
         out = self.folder / "out"

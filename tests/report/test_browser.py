@@ -17,7 +17,7 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import stored, summary_of
-from tests.report.test_color_scales import farther
+from tests.report.test_results import farther
 from tests.share.chromium import Chromium, chromium
 from tests.viewer.scenes import box_cloud
 

@@ -9,6 +9,7 @@ import pytest
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import CaptureSize
+from pano_mvs.engine.planning.forecast import Experience
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session import planning as forecasting
 from pano_mvs.session.planning import (
@@ -122,7 +123,7 @@ def test_the_report_is_remembered_only_if_something_was_computed(toy: Toy) -> No
     assert stages is not None
     remember_report(again, 50.0)
     some = [stage for stage in stages.stages if stage.stage == "images"]
-    assert expected_report_s(some, size, (Store(toy.folder / "cache").unit_times,)) == 0.0
+    assert expected_report_s(some, Experience(size, (Store(toy.folder / "cache").unit_times,))) == 0.0
     remember_report(fresh, 50.0)
     changed = toy.session("scaled.by=9")
     run = Run(changed.workflow, changed.graph, Store(changed.store_root), out=changed.out)

@@ -1,17 +1,48 @@
-"""Workflows run and planned from Python: what is returned, what is reported on the way, and what is an error."""
+"""Workflows run and planned from Python: what is returned, reported on the way and written, and what is an error."""
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
+from typing import get_args
 
+import numpy as np
 import pytest
 
 import pano_mvs
 from pano_mvs.engine.cache.blobs import DamagedBlobError
-from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFailed, UnitFinished
-from pano_mvs.session.progress import Event, RunFinished, RunStarted
+from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.engine.running.events import (
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    UnitStarted,
+    Warned,
+    ignore,
+)
+from pano_mvs.results.records import Finding, PairLink, Tile, Verdict
+from pano_mvs.scene import TwoView
+from pano_mvs.session.progress import (
+    EVENTS_FILE,
+    BlockStarted,
+    Divided,
+    Event,
+    EventLog,
+    EventReader,
+    Forecast,
+    KernelsCompiled,
+    RunFinished,
+    RunStarted,
+    TimeLeft,
+    WorkersChanged,
+    event_from_line,
+    line_from_event,
+)
 from pano_mvs.session.python_calls import arguments_from_options, overrides_from_settings
 from pano_mvs.session.running import Execution
+from pano_mvs.session.summarise import pair_links
 from tests.engine.conftest import Toy
 
 
@@ -179,3 +210,104 @@ def test_execution_takes_the_place_of_the_name_of_an_executor(toy: Toy) -> None:
 def test_only_options_become_arguments() -> None:
     message = "a--images b: --json, /x/--out y (--min-free) --workers --cache"
     assert arguments_from_options(message) == "a--images b: --json, /x/--out y ($PANO_MVS_MIN_FREE) workers cache"
+
+
+VERDICT = Verdict("fair", "Finished", "Usable.", "4 units.", (Tile("images", "4"),), (Finding("fair", "blurred"),))
+EVENTS: tuple[Event, ...] = (
+    RunStarted("lobby", ("images", "depth"), "slurm", workers=3, threads=2, out=Path("out"), cache=Path("/cache")),
+    Forecast((StageForecast("depth", ("images",), 1, None, 2.5, None),), report_s=3.0),
+    KernelsCompiled(3, 1.5),
+    WorkersChanged(2),
+    StageStarted("depth", 4),
+    UnitStarted("depth", "ä\u2028.png"),
+    UnitFailed("depth", "b.png", "too dark", "there is no range", "logs/b.log", ("line", "\x1b")),
+    UnitFinished("depth", "a.png", "run", 1.25),
+    StageFinished("depth", "depth.sweep", 4, 3, 0, 1, 0, 2.0, 4.0, {"kept": 0.5}),
+    TimeLeft(12.5, at_least=True, done=0.25, unknown=("depth",)),
+    Warned("disk"),
+    Divided("26 panoramas are run in 3 blocks"),
+    BlockStarted("block_2", 2, 3, images=12, images_left=12),
+    RunFinished(3, "", run=3, failed=1, seconds=9.0, out=Path("out"), verdict=VERDICT, doubts={"a": "b"}),
+)
+
+
+def test_a_line_has_the_fields_of_the_event() -> None:
+    line = json.loads(line_from_event(UnitFinished("depth", "a.png", "run", 1.25)))
+    del line["time"]
+    assert line == {"event": "unit_finished", "stage": "depth", "item": "a.png", "outcome": "run", "seconds": 1.25}
+
+
+def test_every_event_comes_back() -> None:
+    assert {type(event) for event in EVENTS} == set(get_args(Event))
+    found = [event_from_line(line_from_event(event)) for event in EVENTS]
+    assert [pair[1] for pair in found if pair is not None] == list(EVENTS)
+
+
+@pytest.mark.parametrize("line", ["", "{", "[]", '{"event": "later", "time": 1}', '{"event": "warning", "time": 1}'])
+def test_other_lines_are_no_events(line: str) -> None:
+    assert event_from_line(line) is None
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows keeps files that are open")
+def test_reader_follows_the_file_and_notices_another_run(tmp_path: Path) -> None:
+    passed: list[Event] = []
+    log, reader = EventLog(passed.append), EventReader(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"events\.jsonl"):
+        reader.read()
+    log(EVENTS[0])
+    log.open(tmp_path)
+    assert [event for _, event in reader.read()[1]] == [EVENTS[0]]
+    log(EVENTS[4])
+    with (tmp_path / EVENTS_FILE).open("ab") as stream:
+        stream.write(b'{"event": "warning",')
+        stream.flush()
+        assert [event for _, event in reader.read()[1]] == [EVENTS[4]]
+        stream.write(b' "time": 1, "text": "late"}\n')
+    assert reader.read() == (False, [(1.0, Warned("late"))])
+
+    second = EventLog(ignore)
+    second.open(tmp_path)
+    log(EVENTS[-1])  # the first run still writes into its own file
+    second(EVENTS[5])
+    second(EVENTS[-1])
+    is_new, events = reader.read()
+    assert is_new
+    assert [event for _, event in events] == [EVENTS[5], EVENTS[-1]]
+    assert passed == [EVENTS[0], EVENTS[4], EVENTS[-1]]
+
+
+def test_run_goes_on_without_the_file(tmp_path: Path) -> None:
+    (tmp_path / "logs").write_text("in the way")
+    passed: list[Event] = []
+    log = EventLog(passed.append)
+    log.open(tmp_path)
+    log(EVENTS[0])
+    assert isinstance(passed[0], Warned)
+    assert passed[1:] == [EVENTS[0]]
+
+
+def _view(matches: int, candidates: int) -> TwoView:
+    matches_idx = np.tile(np.arange(matches, dtype=np.int32)[:, None], (1, 2))
+    residuals = np.full(matches, np.deg2rad(0.1), np.float32)
+    return TwoView(matches_idx, np.eye(3), np.array([1.0, 0, 0]), residuals, "general", candidates=candidates)
+
+
+def test_pairs_of_a_later_stage_replace_rejected_ones_and_are_added() -> None:
+    matched: dict[tuple[str, ...], dict[str, float]] = {
+        ("a", "b"): {"candidates": 80.0, "inliers": 60.0, "residual_deg": 0.05},
+        ("b", "c"): {"candidates": 30.0, "inliers": 0.0},
+        ("a", "c"): {"candidates": 20.0},
+    }
+    later: dict[tuple[str, str], TwoView] = {
+        ("a", "b"): _view(50, 70),
+        ("b", "c"): _view(12, 33),
+        ("a", "c"): TwoView.failed("too few"),
+        ("c", "d"): _view(9, 15),
+    }
+    assert pair_links(matched, later) == (
+        PairLink("a", "b", 60, 80, 0.05),
+        PairLink("b", "c", 12, 33, 0.1),
+        PairLink("a", "c", 0, 20, None),
+        PairLink("c", "d", 9, 15, 0.1),
+    )
+    assert pair_links(matched, {})[1] == PairLink("b", "c", 0, 30, None)

@@ -46,15 +46,12 @@ GROUPS = {
         ),
         (
             "tests/core/test_digests.py",
-            *_engine("stages/code_digest", "stages/stage_code", "planning/resolve", "running/run"),
+            *_engine("stages/stage_code", "planning/resolve", "running/run"),
         ),
     ),
     "store": Group(
         ("pano_mvs/engine/cache/store.py", "pano_mvs/engine/cache/blobs.py"),
-        (
-            *_engine("cache/store", "cache/store_promises", "cache/hostile_store", "cache/stat_cache"),
-            "tests/engine/test_layout.py",
-        ),
+        _engine("cache/store", "cache/hostile_store", "cache/stat_cache"),
     ),
     "wiring": Group(
         ("pano_mvs/engine/workflows/wiring.py",), _engine("workflows/wiring", "workflows/workflow", "running/run")
@@ -62,7 +59,7 @@ GROUPS = {
     "run_pass": Group(("pano_mvs/engine/running/run.py",), _TESTS_OF_RUNS, within="RunPass"),
     "run": Group(
         ("pano_mvs/engine/running/run.py",),
-        (*_TESTS_OF_RUNS, *_engine("running/run_promises", "running/options")),
+        _TESTS_OF_RUNS,
         within="Run",
     ),
 }

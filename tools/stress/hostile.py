@@ -285,10 +285,7 @@ GROUPS = {
         (
             "tests/tools/test_stress.py::test_hostile_files_of_a_kind",
             "tests/io/images/test_hostile_metadata.py",
-            *(
-                f"{_READ}{name}"
-                for name in ("one_bad", "only_bad", "names", "linked", "masks", "two_id", "what", "a_f")
-            ),
+            *(f"{_READ}{name}" for name in ("input_that", "names", "linked", "two_id", "a_f")),
             *(f"{_OUTPUTS}test_{name}" for name in ("hostile_names_in_run_json", "commands", "links")),
             f"{_OUTPUTS}test_arrays",
         ),
@@ -308,7 +305,7 @@ GROUPS = {
             "tests/core/test_process_state.py::test_changes",
         ),
     ),
-    "commands": Group(20, ("tests/cli/test_bad_paths.py", "tests/cli/workflows/test_every_mistake.py")),
+    "commands": Group(20, tuple(f"{_READ}{name}" for name in ("path_that", "an_empty_path"))),
     "page": Group(20, ("tests/share/test_hostile_page.py",)),
 }
 MOST_FAULTS = 2

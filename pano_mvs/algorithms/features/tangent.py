@@ -21,10 +21,6 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
-# Distance from masked pixels, in key point sizes: SIFT's patch extends three sizes from its centre, with decreasing
-# weights, with less than a quarter of the weight beyond this distance; ORB's extends half a size plus a tenth for
-# smoothing.
-SIFT_CLEARANCE, _ORB_CLEARANCE = 1.5, 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +82,8 @@ def extract_sift(
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
         return _Found(pixels, *_sizes_and_scores(keypoints), root_sift(described) if root else described)
 
-    found = _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=SIFT_CLEARANCE)
+    # SIFT's patch extends three sizes from its centre, with less than a quarter of its weight beyond this distance.
+    found = _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=1.5)
     return replace(found, size_hw=size_hw)
 
 
@@ -142,7 +139,8 @@ def extract_orb(
         return _Found(pixels, *_sizes_and_scores(keypoints), described)
 
     _check(image, mask)
-    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming", clearance=_ORB_CLEARANCE)
+    # ORB's patch extends half a size, plus a tenth for smoothing.
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming", clearance=0.6)
 
 
 def _extract(

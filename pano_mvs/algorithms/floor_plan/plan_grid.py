@@ -107,9 +107,6 @@ def _levels(heights: FloatArray, step: float) -> list[float]:
     return [float(np.median(heights[np.abs(heights - middle) < 3 * step])) for middle in middles]
 
 
-_HEIGHT_BITS = 20
-
-
 @dataclass(frozen=True)
 class Extent:
     """Where a grid lies: its pixels are squares, and its first row is the farthest along y.
@@ -167,7 +164,7 @@ class Orthophoto:
         index, inside = self.extent.cells(points[:, :2])
         inside &= (points[:, 2] >= self._low) & (points[:, 2] <= self._cut)
         share = (points[inside, 2] - self._low) / max(self._cut - self._low, 1e-12)
-        level = 1 + (share * ((1 << _HEIGHT_BITS) - 2)).astype(np.int64)
+        level = 1 + (share * ((1 << 20) - 2)).astype(np.int64)
         red, green, blue = colors_rgb[inside].astype(np.int64).T
         np.maximum.at(self._photo, index[inside], (level << 24) | (red << 16) | (green << 8) | blue)
 

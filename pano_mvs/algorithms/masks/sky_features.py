@@ -16,8 +16,6 @@ from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, sample_panorama
 
-# Below this parallax, infinity and the range look the same.
-_MIN_PARALLAX_PX = 1.0
 # Grey levels by which colours agree better.
 _CLEARLY = 3.0
 # Where a surface lies beside an area, and from how many pixels a median is taken.
@@ -106,7 +104,8 @@ class View:
     @cached_property
     def confirmed(self) -> Mask:
         """The pixels whose ranges other views confirm under a parallax."""
-        return np.asarray(self.consistent & (self.parallax_px > _MIN_PARALLAX_PX))
+        # Below a pixel of parallax, infinity and the range look the same.
+        return np.asarray(self.consistent & (self.parallax_px > 1.0))
 
     @cached_property
     def errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -40,8 +40,6 @@ NO_PLANES: Planes = np.zeros((0, 3)), np.zeros(0)
 # Finer cells than these follow the noise of the ranges: pictures of views that were left out become worse.
 MAX_CELLS = 1 << 23
 
-# Ranges on the planes of a place are not more accurate than this, relative to them.
-_PLANE_UNCERTAINTY = 0.01
 _GAPS = 3, 5, 9, 17
 # How much a range counts that is not confirmed; others count by the probability that they are right.
 _LEAST_SUPPORT = np.float32(0.2)
@@ -58,9 +56,10 @@ def most_certain(range_map: RangeMap, measured: RangeMap) -> RangeMap:
     """
     if measured.uncertainty is None or range_map.uncertainty is None or measured.range.shape != range_map.range.shape:
         return range_map
+    # Ranges on the planes of a place are not more accurate than 1 %.
     precise = (
         (measured.confidence >= CONSISTENT_CONFIDENCE[0])
-        & (measured.uncertainty < np.fmax(range_map.uncertainty, _PLANE_UNCERTAINTY))
+        & (measured.uncertainty < np.fmax(range_map.uncertainty, 0.01))
         & (range_map.confidence != MIRROR_CONFIDENCE)
     )
     normals = range_map.normals_in_cam

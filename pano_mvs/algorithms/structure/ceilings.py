@@ -25,26 +25,17 @@ from pano_mvs.algorithms.structure.skyline import (
 from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_ranges
 from pano_mvs.core.arrays import FloatArray
 
-_FINE_DISTANCES, _CEILING_VIEWS = np.geomspace(0.35, 9.0, 220), 12
+_FINE_DISTANCES = np.geomspace(0.35, 9.0, 220)
 # Heights of a ceiling above the cameras that are tried, in heights of the camera above the floor.
 _CEILINGS = np.geomspace(0.3, 1.6, 36)
 # Heights relative to that of a ceiling in ranges, and to the best of these.
 _MOVED_CEILINGS, _FINE_CEILINGS = np.linspace(0.9, 1.1, 11), np.linspace(0.98, 1.02, 9)
-# A ceiling is moved if its ranges are less certain: a plain one of a rendered house was at 0.05, and those of three
-# rendered captures, at most 1 % off, at 0.014 or less.
-_PLAIN_UNCERTAINTY = 0.02
 # Creases show its height if their mean clarity differs by this much between the heights: in plain boxes without visible
 # creases it differed by at most 0.018, with and without noise, in rendered houses by 0.25 to 0.5, and in two groups of
 # a real tour, over all heights, by 0.16 and 0.30.
 _LEAST_SHOWN = 0.05
-# They show that it is wrong if they are clearer at the best height by this share of that difference: at exact heights
-# with clear creases, the share was below 0.002, and where heights were 1.4 % off or more, above 0.03.
-_LEAST_GAIN = 0.01
-# Moved ceilings were at most 1.3 % off in nine houses, but up to 3.5 % in boxes with faint creases.
-_MOVED_UNCERTAINTY = 0.02
-# Views show its height if this solid angle of their ranges is within a relative distance from it.
-_LEAST_AREA, _NEAR, _LEAST_VIEWS = 0.2, 0.1, 3
-_SAME_HEIGHT = 0.02
+# Views show its height if this solid angle of their ranges is near it.
+_LEAST_AREA = 0.2
 
 
 def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
@@ -88,12 +79,13 @@ def moved_ceilings(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> 
             continue
         middle = float(np.mean([view.cam_from_world.center[1] for view in below]))
         floors = [other for other in planes if other.normal[1] < 0 and other.y > middle]
-        is_plain = plane.uncertainty > _PLAIN_UNCERTAINTY
-        if floors and is_plain and len(below) >= _LEAST_VIEWS:
+        # A plain ceiling of a rendered house was at 0.05, those of three captures, at most 1 % off, at 0.014 or less.
+        is_plain = plane.uncertainty > 0.02
+        if floors and is_plain and len(below) >= 3:
             # Of floors a little apart, views show nearly the same area.
             floor = max(floors, key=lambda other: other.support * sum(_area_on(view, other) for view in below))
             plane = _moved_ceiling(below, floor, plane)
-        if not any(other.normal[1] > 0 and abs(other.y - plane.y) < _SAME_HEIGHT * (middle - plane.y)
+        if not any(other.normal[1] > 0 and abs(other.y - plane.y) < 0.02 * (middle - plane.y)
                    for other in result):  # fmt: skip
             result.append(plane)
     return result
@@ -109,9 +101,11 @@ def _moved_ceiling(views: Sequence[PlaneView], floor: ScenePlane, ceiling: Scene
     if shown < _LEAST_SHOWN or best in (0, len(totals) - 1):
         return ceiling
     share = clarity.clearest(_MOVED_CEILINGS[best] * _FINE_CEILINGS)
-    if clarity.total(share) - clarity.total(1.0) < _LEAST_GAIN * shown:
+    # At exact heights with clear creases, this share was below 0.002, and where heights were 1.4 % off, above 0.03.
+    if clarity.total(share) - clarity.total(1.0) < 0.01 * shown:
         return ceiling
-    return replace(clarity.ceiling_at(share), uncertainty=max(ceiling.uncertainty, _MOVED_UNCERTAINTY))
+    # Moved ceilings were at most 1.3 % off in nine houses, but up to 3.5 % in boxes with faint creases.
+    return replace(clarity.ceiling_at(share), uncertainty=max(ceiling.uncertainty, 0.02))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +128,7 @@ class _HeightClarity:
         if not views:
             return None
         middle = float(np.mean([view.cam_from_world.center[1] for view in views]))
-        around = coarsely_around(views, planes, _CEILING_VIEWS)
+        around = coarsely_around(views, planes, 12)
         turn = clearest_turn(around[:: -(-len(around) // TURN_VIEWS)], planes)
         seen = []
         for one in around:
@@ -169,7 +163,7 @@ def _area_on(view: PlaneView, plane: ScenePlane) -> float:
     """Return the solid angle of a view whose ranges are near a plane."""
     ranges = plane_ranges(view.rays, view.cam_from_world.center, normal=plane.normal, offset=plane.offset)
     with np.errstate(invalid="ignore"):
-        return float(view.area[np.abs(view.ranges / ranges - 1) < _NEAR].sum())
+        return float(view.area[np.abs(view.ranges / ranges - 1) < 0.1].sum())
 
 
 def _is_roofed(view: PlaneView) -> bool:

@@ -41,11 +41,6 @@ _COARSE_STEPS = 2
 # The planes must be seen on their sides of the crease, this far from it.
 _BESIDE_RAD = np.radians([2.0, 3.5])
 
-# The standard deviation of the turn of a plane, in radians, relative to that of its distance.
-_TURN_STD = 0.6
-# Level planes are wide: in ranges of three rendered captures they were 0.02 to 0.8 % off. Cornices along all walls
-# would move them farther.
-_LEVEL_STD = 1 / 3
 # A shift by one standard deviation costs about this share of the contrast across the crease, and larger ones less than
 # its square: Cauchy weights begin to fall at as many standard deviations.
 _LOSS, _TAIL = 0.025, 2.0
@@ -156,8 +151,8 @@ class _Placement:
 
     @property
     def stds(self) -> FloatArray:
-        """Standard deviations of shift and turn, before any crease is known."""
-        return np.array([1.0, _TURN_STD]) * self.plane.uncertainty
+        """Standard deviations of the shift, relative to the distance, and of the turn, before any crease is known."""
+        return np.array([1.0, 0.6]) * self.plane.uncertainty
 
     def move(self, heights: FloatArray) -> None:
         """Move the plane to where most of the contrast across creases is."""
@@ -271,9 +266,9 @@ def _adjust(
     column = {idx: number for number, idx in enumerate(levels)}
     own = {idx: len(levels) + 2 * number for number, idx in enumerate(placed)}
     scales = np.array([level_distances[idx] for idx in levels])
-    stds = np.concatenate(
-        [[_LEVEL_STD * planes[idx].uncertainty for idx in levels], *(one.stds for one in placed.values())]
-    )
+    # Level planes are wide: in ranges of three rendered captures they were 0.02 to 0.8 % off. Cornices along all walls
+    # would move them farther.
+    stds = np.concatenate([[planes[idx].uncertainty / 3 for idx in levels], *(one.stds for one in placed.values())])
     start = np.array([heights[idx] for idx in levels])
     stds[np.argmin(stds[: len(levels)])] *= 0.01  # it stays: creases show no scale
     turns = np.array([at + 1 for at in own.values()])

@@ -49,7 +49,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         cache: the cache folder; by default that of a preset that is run in the current folder.
         out: the folder of the results, with the same default.
     """
-    from pano_mvs.cli.cache.command import cache_root
+    from pano_mvs.cli.cache_commands import cache_root
     from pano_mvs.cli.doctor.checks import (
         folder_finding,
         kernel_cache_finding,

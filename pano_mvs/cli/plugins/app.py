@@ -1,15 +1,24 @@
-"""Options of `pano-mvs plugins`, `plugin new` and `stage show`; `show` and `new` do the work."""
+"""`pano-mvs plugins`, `plugin new` and `stage show`: list plugins and stages, describe a stage, write a plugin."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
+from rich.table import Table
 
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.error_messages import guarded
+from pano_mvs.core.errors import UsageError, WorkflowError
+
+if TYPE_CHECKING:  # a command loads what it needs itself
+    from pano_mvs.engine.stages.registry import Plugin, Registry
+    from pano_mvs.engine.stages.stage import StageSpec
 
 plugin_app = typer.Typer(help="Create plugins.", no_args_is_help=True)
 stage_app = typer.Typer(help="Describe a stage.", no_args_is_help=True)
@@ -27,9 +36,22 @@ FileOption = Annotated[
 @guarded
 def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
     """List all plugins with their origin, whether they can be loaded, and their stages."""
-    from pano_mvs.cli.plugins.show import show_plugins
-
-    show_plugins(Console(), workflow=workflow, files=files or [])
+    console, (registry, _) = Console(), _registry(workflow, files or [])
+    found = Table("plugin", "", "gives")
+    for plugin in registry.plugins:
+        found.add_row(escape(plugin.origin), "[red]broken[/]" if plugin.error else "ok", _gives(plugin))
+    console.print(found)
+    table = Table("stage", "version", "from", "")
+    for name, spec in sorted(registry.stages.items()):
+        doc = spec.doc.splitlines()[0] if spec.doc else ""
+        table.add_row(name, str(spec.version), escape(registry.origins[name]), escape(doc))
+    console.print(table)
+    for (kind, name), mark in sorted(registry.registrations.items()):
+        console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
+    for clash in registry.clashes.values():
+        console.say(f"[red]twice:[/] {escape(clash)}")
+    for plugin in registry.broken:
+        console.say(f"[red]broken:[/] {escape(plugin.why_broken())}")
 
 
 @stage_app.command("show")
@@ -42,9 +64,67 @@ def stage_show(
     files: FileOption = None,
 ) -> None:
     """Show the ports, settings and documentation of a stage, or why it cannot be loaded."""
-    from pano_mvs.cli.plugins.show import show_stage
+    from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 
-    show_stage(name, Console(), workflow=workflow, files=files or [])
+    console, (registry, mistakes) = Console(), _registry(workflow, files or [])
+    spec = registry.stages.get(name)
+    if spec is None:
+        if mistakes is not None:
+            raise mistakes
+        raise UsageError(f"there is no stage {name!r}; {registry.suggest(name)}")
+    console.print(f"[bold]{name}[/] version {spec.version} from {escape(registry.origins[name])}", highlight=False)
+    console.print(escape(spec.doc), highlight=False)
+    for port in spec.all_ports:
+        console.print(escape(f"  in   {port}"), highlight=False)
+    console.print(escape(f"  out  {spec.output.kind_name()}"), highlight=False)
+    console.print(_settings(spec))
+    console.print(f"and for every stage: {', '.join(RESERVED_KEYS)}", highlight=False)
+
+
+def _settings(spec: StageSpec) -> Table:
+    from pydantic_core import PydanticUndefined
+
+    table = Table("setting", "type", "default", "")
+    properties = spec.params_type.model_json_schema()["properties"] if spec.params_type.model_fields else {}
+    for field_name, field in spec.params_type.model_fields.items():
+        schema = properties.get(field_name, {})
+        default = "required" if field.default is PydanticUndefined else json.dumps(field.default, default=str)
+        table.add_row(field_name, escape(_type_name(schema)), escape(default), escape(field.description or ""))
+    return table
+
+
+def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, WorkflowError | None]:
+    """Return the registry with the plugins of a workflow and of files, and the mistakes in the workflow."""
+    from pano_mvs.engine.stages.registry import Registry
+    from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
+    from pano_mvs.session.session import presets_folder
+
+    registry = Registry.installed()
+    for path in files:
+        registry.add_file(path)
+    if workflow is None:
+        return registry, None
+    try:
+        load_workflow(find_workflow(workflow, presets_folder())[0], registry, presets=presets_folder())
+    except WorkflowError as error:  # the plugins can be shown nevertheless
+        return registry, error
+    return registry, None
+
+
+def _gives(plugin: Plugin) -> str:
+    stages = [name for kind, name in plugin.names if kind == "stage"]
+    others = [f"{kind} {name}" for kind, name in plugin.names if kind != "stage"]
+    counted = [f"{len(stages)} stages"] if len(stages) > 3 else stages
+    return escape(", ".join([*counted, *others]))
+
+
+def _type_name(schema: dict[str, object]) -> str:
+    if "enum" in schema:
+        options = schema["enum"]
+        return " | ".join(map(str, options)) if isinstance(options, list) else str(options)
+    if "anyOf" in schema and isinstance(schema["anyOf"], list):
+        return " | ".join(_type_name(option) for option in schema["anyOf"])
+    return str(schema.get("const", schema.get("type", "")))
 
 
 @plugin_app.command("new")

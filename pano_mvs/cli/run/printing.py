@@ -16,8 +16,7 @@ from pano_mvs.core.text import one_line, plural
 from pano_mvs.results.records import Number, ScoresSummary, Verdict
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary, cache_of
-from pano_mvs.session.commands import run_command
-from pano_mvs.session.session import Session
+from pano_mvs.session.session import Session, run_command
 from pano_mvs.viewer.shown_scene import is_to_see
 
 _SHOWN_FAILURES = 20
@@ -37,7 +36,11 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     counts = f"{units.run} {plural(units.run, 'unit')} computed, {units.cached} cached{failed}"
     console.print(f"\n{counts} in {summary.seconds or 0:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
-    _print_poses(summary, console)
+    if poses := summary.poses:
+        total = len(poses.registered) + len(poses.rejected)
+        points = f"{poses.points} {plural(poses.points, 'point')}"
+        text = f"poses: {len(poses.registered)} of {total} registered, {points}; scale: {poses.scale}"
+        console.print(escape(text), highlight=False)
     print_scores(summary.scores, console)
     _print_comparison(summary.all_scores, console)
     for note in summary.notes:
@@ -99,15 +102,6 @@ def _print_failures(summary: RunSummary, console: Console) -> None:
     for image, rejected in summary.rejected.items():
         text = f"{one_line(image)}: {rejected.reason}"
         console.say(f"[yellow]left out:[/] {escape(text)}")
-
-
-def _print_poses(summary: RunSummary, console: Console) -> None:
-    poses = summary.poses
-    if poses:
-        total = len(poses.registered) + len(poses.rejected)
-        points = f"{poses.points} {plural(poses.points, 'point')}"
-        text = f"poses: {len(poses.registered)} of {total} registered, {points}; scale: {poses.scale}"
-        console.print(escape(text), highlight=False)
 
 
 def print_verdict(verdict: Verdict, console: Console) -> None:

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.streams import apart
-from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
+from pano_mvs.core.text import clock_text, duration_text, one_line, shortened, shortened_list
 from pano_mvs.engine.running.events import StageFinished, UnitFailed, Warned
 from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
@@ -35,13 +35,15 @@ class ProgressDisplay:
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console
         self._clock = clock
-        self._estimator = TimeEstimator(clock)
-        self._countdown = Countdown()
-        self._began = clock()
         self._lock = threading.RLock()  # the display is drawn by a thread of its own
+        self._restart()
         self._file = cast(TextIO, console.file)
         self._open = ExitStack()
         self._beginning = "starting"  # what is done before any unit
+
+    def _restart(self) -> None:
+        """Forget an earlier run."""
+        self._estimator, self._countdown, self._began = TimeEstimator(self._clock), Countdown(), self._clock()
         self._kernels, self._kernels_at = 0, -math.inf
 
     def __enter__(self) -> ProgressDisplay:
@@ -73,6 +75,8 @@ class ProgressDisplay:
     def __call__(self, event: Event) -> None:
         """Show an event."""
         with self._lock:
+            if isinstance(event, RunStarted):
+                self._restart()
             self._estimator(event)
         if not isinstance(event, Warned):
             self._beginning = "listing the images and looking for copies" if isinstance(event, RunStarted) else ""
@@ -83,7 +87,7 @@ class ProgressDisplay:
                 self._kernels, self._kernels_at = kernels, self._clock()
             case UnitFailed():
                 label = f"{event.stage}:{event.item}" if event.item else event.stage
-                self.console.say(f"[red]failed[/] {escape(label)}")
+                self.console.say(f"[red]failed[/] {escape(one_line(f'{label}: {shortened(event.cause, 300)}'))}")
                 for line in event.said[-5:]:
                     self.console.say(f"  | {escape(line)}")
             case StageFinished():
@@ -127,7 +131,7 @@ class ProgressDisplay:
                 clock_text(now - self._began),
                 Text(text, overflow="ellipsis", no_wrap=True),
             )
-            return Group(table, total)
+            return Group(table, total, *map(Text, self._further()))
 
     def print_line(self) -> None:
         """Print the state of the run in one line."""
@@ -136,8 +140,13 @@ class ProgressDisplay:
             text = self._left_text(left, duration_text(left.seconds_left), left.seconds_left)
             stages = [f"{one_line(name)} {_count(stage)}" for name, stage in self._running()]
             stages += filter(None, [self._compiling()])
-        now = f" (now: {shortened_list(stages)})" if stages else ""
-        self.console.say(escape(f"{100 * left.done:.0f} %, {text}{now}"))
+            now = f" (now: {shortened_list(stages)})" if stages else ""
+            line = "; ".join([f"{100 * left.done:.0f} %, {text}{now}", *self._further()])
+        self.console.say(escape(line))
+
+    def _further(self) -> list[str]:
+        """Return lines to show below the others."""
+        return []
 
     def _running(self) -> list[tuple[str, StageProgress]]:
         return [(name, stage) for name, stage in self._estimator.stages.items() if stage.running]

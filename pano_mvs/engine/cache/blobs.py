@@ -158,7 +158,9 @@ class BlobStore:
         place = self.verified_place(ref)
         try:
             if ref.suffix == ARRAY:
-                return _array(_mapped(place) if ref.is_mapped else place.read_bytes())
+                if not ref.is_mapped:
+                    return _array(place.read_bytes())
+                return _array(place.mapped() if isinstance(place, Packed) else np.memmap(place, np.uint8, "r"))
             if ref.suffix == JSON:
                 value = json.loads(place.read_bytes())
                 if not isinstance(value, dict):
@@ -301,10 +303,6 @@ def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:
         return place.content_digest() == ref.digest
     found = place.stat()
     return stat.S_ISREG(found.st_mode) and found.st_size == ref.size_bytes and digest_from_file(place) == ref.digest
-
-
-def _mapped(place: Path | Packed) -> NDArray[np.uint8]:
-    return place.mapped() if isinstance(place, Packed) else np.memmap(place, np.uint8, "r")
 
 
 def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:

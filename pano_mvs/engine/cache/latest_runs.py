@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import StoreError, UsageError
@@ -153,10 +153,7 @@ def _read(path: Path) -> RunEntry | None:
         workflow, out, when = (str(value[name]) for name in ("workflow", "out", "when"))
         if datetime.fromisoformat(when).utcoffset() is None or not "1970" < when[:4] < "9999":
             raise ValueError("not the time of a run")
-        return RunEntry(path.stem, workflow, out, when, _keys(value["keys"]), pinned=path.parent.name == "pins")
+        keys = {str(stage): {str(item): str(key) for item, key in of.items()} for stage, of in value["keys"].items()}
+        return RunEntry(path.stem, workflow, out, when, keys, pinned=path.parent.name == "pins")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-
-
-def _keys(value: Mapping[str, Mapping[str, Any]]) -> Keys:
-    return {str(stage): {str(item): str(key) for item, key in units.items()} for stage, units in value.items()}

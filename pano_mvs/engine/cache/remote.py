@@ -18,14 +18,14 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pano_mvs.core.digest import IS_DIGEST, digest_from_file
+from pano_mvs.core.digest import IS_DIGEST
 from pano_mvs.core.errors import PanoMvsError, StoreError, UsageError
 from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import CACHE_MARK, checked_body, read_regular, remove_whole, replacing
 from pano_mvs.core.paths import below, is_file, is_link
 from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, refuse_link
 from pano_mvs.engine.cache.packs import RECORD, values_of
-from pano_mvs.engine.cache.store import Store, record_from_bytes
+from pano_mvs.engine.cache.store import Store, is_intact
 
 Progress = Callable[[int, int], None]  # called with the bytes that are copied so far, and all bytes to copy
 _AT_A_TIME = 8
@@ -232,25 +232,15 @@ def _problem(name: str, path: Path, *, index: Path) -> str:
         index: its own path, which is beside its pack if it is an index.
     """
     folder, stem = name.partition("/")[0], PurePosixPath(name).stem
-    if folder == "blobs":
-        return "" if digest_from_file(path) == stem else "is damaged"
-    if folder == "records":
-        record = record_from_bytes(read_regular(path))
-        return "" if record is not None and record.key == stem else "is damaged"
+    if folder in ("blobs", "records"):
+        return "" if is_intact(path, stem, is_record=folder == "records") else "is damaged"
     if folder == "packs" and name.endswith(".index"):
         try:
             values = values_of(index.with_suffix(".pack"), path)
         except ValueError:
             return "is damaged"
-        for value in values:
-            if value.kind == RECORD:
-                record = record_from_bytes(value.read_bytes())
-                is_intact = record is not None and record.key == value.digest
-            else:
-                is_intact = value.content_digest() == value.digest
-            if not is_intact:
-                return f"lists {value.digest}, which is damaged"
-        return ""
+        damaged = (v.digest for v in values if not is_intact(v, v.digest, is_record=v.kind == RECORD))
+        return next((f"lists {digest}, which is damaged" for digest in damaged), "")
     if folder == "packs":
         return ""  # it is checked with its index, which is copied after it
     try:

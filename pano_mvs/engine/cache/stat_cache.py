@@ -101,9 +101,7 @@ def _read(path: Path) -> dict[str, Entry]:
         entries = json.loads(checked_body(read_regular(path)))
     except (OSError, ValueError, RecursionError):
         return {}
-    if not isinstance(entries, dict):
-        return {}
-    return {name: entry for name, entry in entries.items() if _is_entry(entry)}
+    return {} if not isinstance(entries, dict) else {name: entry for name, entry in entries.items() if _is_entry(entry)}
 
 
 def _is_entry(value: object) -> bool:

@@ -17,13 +17,13 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from sys import intern
 from typing import Any
 
-from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_value
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import (
     CACHE_MARK,
@@ -46,81 +46,6 @@ from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
 
 _FULL_BELOW_BYTES = 1_000_000
-
-
-class DiskGuard:
-    """Watches the disk that holds a cache."""
-
-    def __init__(self, root: Path, *, min_free_bytes: int) -> None:
-        """Watch the disk of the folder `root`; no unit starts with less than `min_free_bytes` free."""
-        self._root = root
-        self._min_free_bytes = min_free_bytes
-
-    def require(self) -> None:
-        """Raise StoreError if there is too little free space to start a unit."""
-        free = self._free_bytes()
-        if free < self._min_free_bytes:
-            raise StoreError(
-                f"{free / 1e6:.0f} MB are free on the disk of the cache {self._root}, but "
-                f"{self._min_free_bytes / 1e6:.0f} MB must stay free (--min-free). Make room (`pano-mvs cache gc` "
-                "shows what can be deleted) and run the same command again: finished units stay in the cache"
-            )
-
-    @contextmanager
-    def scratch(self, parent: Path) -> Iterator[Path]:
-        """Yield the absolute path of an empty folder, removed afterwards.
-
-        Raises:
-            StoreError: if the disk is too full to start, or becomes full inside the context.
-        """
-        self.require()
-        try:
-            make_folder(parent)
-            folder = Path(tempfile.mkdtemp(dir=parent.absolute(), prefix=temporary_prefix()))
-        except OSError as error:
-            raise self.cannot_write(error) from error
-        try:
-            yield folder
-            # A library that does not check its writes may have truncated a file on a full disk: keep nothing.
-            if self._is_full():
-                raise self._full()
-        except StoreError:
-            raise
-        except Exception as error:
-            # Libraries report a full disk in many ways: errors without a number, errors of their own, or not at all.
-            if is_full_disk(error) or self._is_full():
-                raise self._full() from error
-            raise
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def cannot_write(self, error: OSError) -> StoreError:
-        """Return the error for a cache that cannot be written."""
-        if is_full_disk(error):
-            return self._full()
-        return StoreError(
-            f"cache {self._root} cannot be written: {error.strerror or error}. Check its permissions, "
-            "or choose another cache with --cache DIR"
-        )
-
-    def _is_full(self) -> bool:
-        return self._free_bytes() < _FULL_BELOW_BYTES
-
-    def _free_bytes(self) -> int:
-        try:
-            return shutil.disk_usage(self._root).free
-        except OSError as error:
-            raise StoreError(
-                f"cache {self._root} cannot be read: {error.strerror}. Check its permissions, or choose another cache "
-                "with --cache DIR"
-            ) from error
-
-    def _full(self) -> StoreError:
-        return StoreError(
-            f"the disk of the cache {self._root} is full, or your quota is used up. Make room (`pano-mvs cache gc` "
-            "shows what can be deleted) and run the same command again: finished units stay in the cache"
-        )
-
 
 LAYOUT_VERSION = 2
 MIN_FREE_BYTES = 200_000_000
@@ -268,7 +193,6 @@ class Store:
         self.min_free_bytes = min_free_bytes
         self.damaged: list[str] = []
         self._records = str(root / "records")
-        self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
         self._open_layout(for_reading=for_reading)
         clear_abandoned(self.root / "tmp", "*")
         self.runs = RunHistory(root)
@@ -374,17 +298,67 @@ class Store:
             self.damaged.append(str(error))
             raise
 
-    def scratch(self) -> AbstractContextManager[Path]:
-        """Return a context with an empty folder in the cache, which is removed afterwards.
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """Yield the absolute path of an empty folder in the cache, removed afterwards.
 
         Raises:
             StoreError: if the disk is too full to start, or becomes full inside the context.
         """
-        return self._disk.scratch(self.blobs.temporary)
+        free = self._free_bytes()
+        if free < self.min_free_bytes:
+            raise StoreError(
+                f"{free / 1e6:.0f} MB are free on the disk of the cache {self.root}, but "
+                f"{self.min_free_bytes / 1e6:.0f} MB must stay free (--min-free). Make room (`pano-mvs cache gc` "
+                "shows what can be deleted) and run the same command again: finished units stay in the cache"
+            )
+        parent = self.blobs.temporary
+        try:
+            make_folder(parent)
+            folder = Path(tempfile.mkdtemp(dir=parent.absolute(), prefix=temporary_prefix()))
+        except OSError as error:
+            raise self.cannot_write(error) from error
+        try:
+            yield folder
+            # A library that does not check its writes may have truncated a file on a full disk: keep nothing.
+            if self._is_full():
+                raise self._full()
+        except StoreError:
+            raise
+        except Exception as error:
+            # Libraries report a full disk in many ways: errors without a number, errors of their own, or not at all.
+            if is_full_disk(error) or self._is_full():
+                raise self._full() from error
+            raise
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def cannot_write(self, error: OSError) -> StoreError:
         """Return the error for a cache that cannot be written, or whose disk is full."""
-        return self._disk.cannot_write(error)
+        if is_full_disk(error):
+            return self._full()
+        return StoreError(
+            f"cache {self.root} cannot be written: {error.strerror or error}. Check its permissions, "
+            "or choose another cache with --cache DIR"
+        )
+
+    def _is_full(self) -> bool:
+        return self._free_bytes() < _FULL_BELOW_BYTES
+
+    def _free_bytes(self) -> int:
+        try:
+            return shutil.disk_usage(self.root).free
+        except OSError as error:
+            raise StoreError(
+                f"cache {self.root} cannot be read: {error.strerror}. Check its permissions, or choose another cache "
+                "with --cache DIR"
+            ) from error
+
+    def _full(self) -> StoreError:
+        return StoreError(
+            f"the disk of the cache {self.root} is full, or your quota is used up. Make room (`pano-mvs cache gc` "
+            "shows what can be deleted) and run the same command again: finished units stay in the cache"
+        )
 
     def record_path(self, key: str) -> Path:
         """Return the path of the record of a key, whether or not it exists."""
@@ -438,6 +412,18 @@ class Store:
             raise UsageError(
                 f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with --cache DIR"
             ) from error
+
+
+def is_intact(place: Path | Packed, digest: str, *, is_record: bool) -> bool:
+    """Return whether a stored value is what its name says: a record that has this key, or bytes that have this digest.
+
+    Raises:
+        OSError: if it cannot be read.
+    """
+    if is_record:
+        record = record_from_bytes(place.read_bytes() if isinstance(place, Packed) else read_regular(place))
+        return record is not None and record.key == digest
+    return (place.content_digest() if isinstance(place, Packed) else digest_from_file(place)) == digest
 
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:

@@ -101,7 +101,9 @@ class UnitTimes:
         similar = self._similar(stage, size, settings=settings, threads=threads)
         if not similar:
             return None
-        scales = [_scale(sample, size, whole=whole) for sample in similar]
+        scales = [
+            size.pixels / sample.pixels * (size.images / max(1, sample.images) if whole else 1.0) for sample in similar
+        ]
         return ExpectedUnit(
             median(sample.seconds * scale for sample, scale in zip(similar, scales, strict=True)),
             median(sample.stored_bytes * scale for sample, scale in zip(similar, scales, strict=True)),
@@ -126,8 +128,12 @@ class UnitTimes:
         def kind(sample: Sample) -> tuple[bool, bool]:
             return sample.settings != settings, sample.threads != threads
 
+        def distance(sample: Sample) -> float:
+            pixels = abs(math.log(size.pixels / sample.pixels))
+            return pixels + abs(math.log(max(1, size.images) / max(1, sample.images)))
+
         latest_first = self._samples.get(stage, [])[::-1]
-        found = sorted(latest_first, key=lambda sample: (kind(sample), _distance(sample, size)))
+        found = sorted(latest_first, key=lambda sample: (kind(sample), distance(sample)))
         return [sample for sample in found if kind(sample) == kind(found[0])][:3]
 
 
@@ -143,16 +149,6 @@ def _file_size(path: Path) -> float:
         return float(height * width)
     found = stat_of(path)
     return float(found.st_size) if found is not None else 1.0
-
-
-def _scale(sample: Sample, size: CaptureSize, *, whole: bool) -> float:
-    by_images = size.images / max(1, sample.images) if whole else 1.0
-    return size.pixels / sample.pixels * by_images
-
-
-def _distance(sample: Sample, size: CaptureSize) -> float:
-    pixels = abs(math.log(size.pixels / sample.pixels))
-    return pixels + abs(math.log(max(1, size.images) / max(1, sample.images)))
 
 
 def _read(path: Path) -> dict[str, list[Sample]]:

@@ -28,7 +28,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.executors.unit_requests import request_to_json
 from pano_mvs.engine.stages.stage_code import code_texts
 
 _CONNECT_S = 20.0
@@ -84,7 +84,6 @@ class DaskExecutor(Executor):
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
         self._out: dict[int, tuple[int, Any]] = {}  # job to its attempt and its future
         self._attempts = 0
-        self._requests: dict[int, Path] = {}  # job to the file with its request, for large requests
         self._sources: dict[str, Any] = {}
         self._cluster = None if isinstance(cluster, str) else cluster
         try:
@@ -107,15 +106,7 @@ class DaskExecutor(Executor):
         request = request_to_json(job, self._store)
         request["cores"] = self.cores
         request["plugin_texts"] = {str(path.absolute()): self._texts(path) for path in job.plugins}
-        text = json.dumps(request)
-        if len(text) > 200_000:
-            path = job.log.with_suffix(".json").absolute()
-            try:
-                path.write_text(text, encoding="utf-8")
-            except OSError as error:
-                raise self._store.cannot_write(error) from error
-            self._requests[job.number] = path
-            text = str(path)
+        text = json.dumps(request)  # large inputs are in a file of their own
         self._attempts += 1
         number, attempt = job.number, self._attempts
         key = f"pano-mvs-{job.unit.key}-{self._run}-{attempt}"
@@ -138,8 +129,6 @@ class DaskExecutor(Executor):
                 return None
             if number in self._out and self._out[number][0] == attempt:
                 del self._out[number]
-                if number in self._requests:
-                    self._requests.pop(number).unlink(missing_ok=True)
                 return number, _outcome(future)
         return None
 
@@ -224,14 +213,14 @@ def run_unit(run: str, text: str, expected: tuple[str, str]) -> str:
 
     Args:
         run: id of the run, to end its processes later.
-        text: the request as JSON, or the path of a file in the cache that contains it.
+        text: the request as JSON.
         expected: as for `objection`.
     """
     if run not in _accepted:
         if problem := objection(introduce(*expected), expected):
             return json.dumps(JobOutcome("stopped", cause=problem, error="UsageError", exit_code=2).to_json())
         _accepted.add(run)
-    request = json.loads(text if text.startswith("{") else Path(text).read_bytes())
+    request = json.loads(text)
     worker = _workers.setdefault((run, threading.get_ident()), _new_worker(request["cores"]))
     return json.dumps(worker.run(request).to_json())
 

@@ -58,7 +58,9 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """
     started, compiling_s = time.perf_counter(), kernel_cache.compilation_time.seconds
     with store.scratch() as scratch:
-        context = Context(np.random.default_rng(_seed(unit)), scratch, threads)
+        # The code does not count, so that seeds do not change with it.
+        seed = digest_from_value({name: part for name, part in unit.identity.items() if name not in OF_CODE})
+        context = Context(np.random.default_rng(int(seed, 16)), scratch, threads)
         arguments = arguments_of(unit, store)
         value = _called(unit, arguments, context)
         spec = unit.entry.spec
@@ -104,11 +106,6 @@ def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
     if changes:
         context.note(f"it changed {', '.join(changes)} in its process; this was undone")
     return value
-
-
-def _seed(unit: Unit) -> int:
-    """Return a seed from a unit's stage, settings and inputs, but not its code: seeds do not change with code."""
-    return int(digest_from_value({name: part for name, part in unit.identity.items() if name not in OF_CODE}), 16)
 
 
 def arguments_of(unit: Unit, store: Store) -> dict[str, Any]:

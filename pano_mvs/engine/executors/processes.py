@@ -22,9 +22,9 @@ from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.started_processes import MARK, end_started
 from pano_mvs.engine.executors.threads import bound_environment
-from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.executors.unit_requests import request_to_json
+from pano_mvs.engine.executors.worker import MARK, end_started
 
 UNITS_PER_PROCESS = 500
 """A worker is replaced after this many units, so that memory leaks of libraries do not add up."""
@@ -117,17 +117,14 @@ class ProcessExecutor(Executor):
                     error="StoreError",
                     exit_code=4,
                 )
-            self._ended.put((job.number, self._judged(outcome, refused=worker.refused)))
+            self._failed_starts = self._failed_starts + 1 if worker.refused else 0
+            if self._failed_starts >= 3:  # several workers in a row ended while starting
+                cause = f"workers do not start: {outcome.cause}"
+                outcome = replace(outcome, status="stopped", cause=cause, error="PanoMvsError")
+            self._ended.put((job.number, outcome))
             if worker.served >= self._units_per_process:
                 worker.stop()
         worker.stop()
-
-    def _judged(self, outcome: JobOutcome, *, refused: bool) -> JobOutcome:
-        """Return the outcome, with status `stopped` if several workers in a row ended while starting."""
-        self._failed_starts = self._failed_starts + 1 if refused else 0
-        if self._failed_starts < 3:
-            return outcome
-        return replace(outcome, status="stopped", cause=f"workers do not start: {outcome.cause}", error="PanoMvsError")
 
 
 _BOOT = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -54,17 +54,8 @@ class JobOutcome:
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as a JSON value, without the identity in its record, which is that of the unit."""
-        return {
-            "status": self.status,
-            "record": None if self.record is None else replace(self.record, identity={}).to_json(),
-            "cause": self.cause,
-            "trace": self.trace,
-            "error": self.error,
-            "exit_code": self.exit_code,
-            "died": self.died,
-            "seconds": self.seconds,
-            "changed": dict(self.changed),
-        }
+        record = None if self.record is None else replace(self.record, identity={}).to_json()
+        return {one.name: getattr(self, one.name) for one in fields(self)} | {"record": record}
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> JobOutcome:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.unit_times import CaptureSize, ExpectedUnit, UnitTimes
@@ -13,6 +14,8 @@ from pano_mvs.engine.stages.stage import INDEX_PORT
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
+
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +49,66 @@ def settings_digest(entry: StageEntry) -> str:
     return digest_from_value(key_fields(entry.params)[0])
 
 
-def forecast(
-    plans: Sequence[StagePlan],
-    workflow: Workflow,
-    graph: Graph,
-    *,
-    size: CaptureSize,
-    histories: Sequence[UnitTimes],
-    threads: int,
-) -> tuple[StageForecast, ...]:
-    """Return what each stage of a plan is expected to take, in the order of the plan.
+@dataclass(frozen=True, slots=True)
+class Experience:
+    """What earlier runs say of the stages, for a capture and a number of threads of each worker."""
 
-    Args:
-        histories: times of earlier runs; the first that has samples of a stage counts.
-    """
-    return tuple(
-        _of_stage(
-            plan,
-            workflow.stages[plan.name],
-            index=_index_of(plan.name, workflow, graph),
-            axis=graph.axes[plan.name],
-            after=tuple(sorted({edge.producer for edge in graph.edges[plan.name].values()})),
-            size=size,
-            histories=histories,
-            threads=threads,
+    size: CaptureSize
+    histories: Sequence[UnitTimes]  # times of earlier runs; the first that has samples of a stage counts
+    threads: int = 1
+
+    def first(self, ask: Callable[[UnitTimes], Answer | None]) -> Answer | None:
+        """Return the answer of the first history that has one; None if nothing is known."""
+        answers = (ask(history) for history in self.histories)
+        return next((answer for answer in answers if answer is not None), None)
+
+    def unit(self, entry: StageEntry, axis: Axis) -> ExpectedUnit | None:
+        """Return what a unit of a stage is expected to take."""
+        use, settings, whole = entry.spec.name, settings_digest(entry), axis is Axis.ONE
+        return self.first(
+            lambda times: times.expected_unit(use, self.size, settings=settings, threads=self.threads, whole=whole)
         )
-        for plan in plans
-    )
+
+    def units(self, plan: StagePlan, entry: StageEntry, axis: Axis, *, index: StageEntry | None) -> int | None:
+        """Return the expected number of units to compute: as planned, or for an open stage by its index or experience.
+
+        Args:
+            index: the stage that decides the units; None if there is none.
+        """
+        images = self.size.images
+        if not plan.open:
+            return len(plan.run) + len(plan.may_run)
+        if axis is not Axis.PAIR:
+            return images
+        if index is not None and index.spec.expected_units is not None:
+            return index.spec.expected_units(index.params, images)
+        settings = settings_digest(entry)
+        return self.first(lambda times: times.expected_pairs(plan.use, images, settings=settings))
 
 
-def expected_memory(
-    workflow: Workflow, graph: Graph, *, size: CaptureSize, histories: Sequence[UnitTimes], threads: int
-) -> dict[str, float]:
+def forecast(
+    plans: Sequence[StagePlan], workflow: Workflow, graph: Graph, *, experience: Experience
+) -> tuple[StageForecast, ...]:
+    """Return what each stage of a plan is expected to take, in the order of the plan."""
+    found = []
+    for plan in plans:
+        entry, axis, edges = workflow.stages[plan.name], graph.axes[plan.name], graph.edges[plan.name]
+        index = workflow.stages[edges[INDEX_PORT].producer] if INDEX_PORT in edges else None
+        unit = experience.unit(entry, axis)
+        found.append(
+            StageForecast(
+                plan.name,
+                tuple(sorted({edge.producer for edge in edges.values()})),
+                cached=len(plan.cached),
+                units=experience.units(plan, entry, axis, index=index),
+                unit_s=None if unit is None else unit.seconds,
+                unit_bytes=None if unit is None else unit.stored_bytes,
+            )
+        )
+    return tuple(found)
+
+
+def expected_memory(workflow: Workflow, graph: Graph, experience: Experience) -> dict[str, float]:
     """Return the bytes that the units for the whole capture are expected to need in memory, by stage.
 
     Only stages that declare it are included, unless the workflow states the memory of a unit.
@@ -86,70 +117,10 @@ def expected_memory(
     for name in graph.order:
         entry = workflow.stages[name]
         if entry.spec.expected_memory is not None and not entry.policy.memory_bytes:
-            unit = _expected_unit(entry, Axis.ONE, size=size, histories=histories, threads=threads)
+            unit = experience.unit(entry, Axis.ONE)
             stored_bytes = 0.0 if unit is None else unit.stored_bytes
-            found[name] = entry.spec.expected_memory(entry.params, size.images, stored_bytes)
+            found[name] = entry.spec.expected_memory(entry.params, experience.size.images, stored_bytes)
     return found
-
-
-def _expected_unit(
-    entry: StageEntry, axis: Axis, *, size: CaptureSize, histories: Sequence[UnitTimes], threads: int
-) -> ExpectedUnit | None:
-    """Return what a unit is expected to take, by the first history that has samples of the stage."""
-    settings, whole = settings_digest(entry), axis is Axis.ONE
-    found = (
-        history.expected_unit(entry.spec.name, size, settings=settings, threads=threads, whole=whole)
-        for history in histories
-    )
-    return next((one for one in found if one is not None), None)
-
-
-def _of_stage(
-    plan: StagePlan,
-    entry: StageEntry,
-    *,
-    index: StageEntry | None,
-    axis: Axis,
-    after: tuple[str, ...],
-    size: CaptureSize,
-    histories: Sequence[UnitTimes],
-    threads: int,
-) -> StageForecast:
-    unit = _expected_unit(entry, axis, size=size, histories=histories, threads=threads)
-    return StageForecast(
-        plan.name,
-        after,
-        cached=len(plan.cached),
-        units=_units(plan, axis, size.images, index=index, histories=histories, settings=settings_digest(entry)),
-        unit_s=None if unit is None else unit.seconds,
-        unit_bytes=None if unit is None else unit.stored_bytes,
-    )
-
-
-def _index_of(name: str, workflow: Workflow, graph: Graph) -> StageEntry | None:
-    """Return the stage that decides the units of another one; None if there is none."""
-    edge = graph.edges[name].get(INDEX_PORT)
-    return None if edge is None else workflow.stages[edge.producer]
-
-
-def _units(
-    plan: StagePlan,
-    axis: Axis,
-    images: int,
-    *,
-    index: StageEntry | None,
-    histories: Sequence[UnitTimes],
-    settings: str,
-) -> int | None:
-    """Return the expected number of units to compute: as planned, or for an open stage by its index or earlier runs."""
-    if not plan.open:
-        return len(plan.run) + len(plan.may_run)
-    if axis is not Axis.PAIR:
-        return images
-    if index is not None and index.spec.expected_units is not None:
-        return index.spec.expected_units(index.params, images)
-    found = (history.expected_pairs(plan.use, images, settings=settings) for history in histories)
-    return next((count for count in found if count is not None), None)
 
 
 def makespan(

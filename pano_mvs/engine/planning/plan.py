@@ -115,7 +115,11 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     if before.get("code") != now["code"]:
         file = f" ({unit.entry.spec.origin.rpartition(':')[0]})" if unit.entry.spec.code_digest else ""
         differences.insert(0, f"code of {now['stage']} changed{file}")
-    differences.extend(_upgrades(before.get("libraries"), now["libraries"]))
+    libraries = before.get("libraries")
+    if isinstance(libraries, Mapping):
+        both = sorted({*libraries} & {*now["libraries"]})
+        pairs = [(name, libraries[name], now["libraries"][name]) for name in both]
+        differences.extend(f"{name} {old} → {new}" for name, old, new in pairs if old != new)
     differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
     return "; ".join(differences) or "this version makes its key differently"
 
@@ -124,13 +128,6 @@ def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     """Return whether two identities differ, and only in the code or the libraries."""
     parts = {*before, *now} - OF_CODE
     return before != now and all(name in before and name in now and before[name] == now[name] for name in parts)
-
-
-def _upgrades(before: object, now: Mapping[str, str]) -> list[str]:
-    """Return the changed versions of the libraries that both identities name."""
-    if not isinstance(before, Mapping):
-        return []
-    return [f"{name} {before[name]} → {now[name]}" for name in sorted({*before} & {*now}) if before[name] != now[name]]
 
 
 def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -204,26 +201,21 @@ def make_plan(
     plans: list[StagePlan] = []
     for name in graph.order:
         entry = workflow.stages[name]
-        state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
-        units, resolution = resolve(entry, graph, states=states, store=store, listing=listing)
-        for unit in units:
-            record = None
-            if not options.refreshes(unit):
-                last_key = last.get(name, {}).get(unit.item)
-                record = store.find(unit.key) or options.acceptable(unit, last_key, store)
+        states[name] = state = StageState(graph.axes[name])
+        plan = StagePlan(name, entry.spec.name)
+        for unit in resolve(entry, graph, states=states, store=store, listing=listing):
+            last_key, is_asked = last.get(name, {}).get(unit.item), options.refreshes(unit)
+            record = None if is_asked else store.find(unit.key) or options.acceptable(unit, last_key, store)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
             else:
                 state.pending.add(unit.item)
-                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, is_asked=options.refreshes(unit))
+                plan.run[unit.item] = "--refresh" if is_asked else reason_to_run(unit, last_key, store)
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
-        state.members, state.failed = resolution.members, resolution.blocked
-        state.pending.update(resolution.waiting)
-        state.open = resolution.open
-        plan.may_run, plan.blocked, plan.open = resolution.waiting, resolution.blocked, resolution.open
-        states[name] = state
+        plan.may_run = [item for item in state.members if item in state.pending and item not in plan.run]
+        plan.blocked, plan.open = state.failed, state.open
         plans.append(plan)
     return plans
 
@@ -232,9 +224,3 @@ def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
     """Enter a unit's result into the state of its stage."""
     state.items[unit.item] = record.output
     state.exploded.update(record.items)
-
-
-def _reason(unit: Unit, last: Mapping[str, str], store: Store, *, is_asked: bool) -> str:
-    if is_asked:
-        return "--refresh"
-    return reason_to_run(unit, last.get(unit.item), store)

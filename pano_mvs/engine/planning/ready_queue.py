@@ -98,6 +98,7 @@ class ReadyQueue:
             _, _, name, item = heapq.heappop(self._ready)
             stage = self._stages[name]
             found = stage.found.pop(item, None) or stage.resolver.unit(item, self.states[name].members[item])
+            assert found is not None, item
             if isinstance(found, Unit):
                 return found
             self._block(stage, item, found)
@@ -156,18 +157,16 @@ class ReadyQueue:
             if self.states[edge.producer].open or (lists_units and edge.producer not in self._complete):
                 return
         if stage.entry.spec.list_items is not None:
-            resolution = resolve_source(
-                stage.entry, self._store, only=self._only.get(stage.entry.name), listing=self.listing
-            )
-            stage.found = {unit.item: unit for unit in resolution.units}
-            state.members.update(resolution.members)
-            notes = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
-            self._listener.source_listed(stage.entry, {item: notes.get(item, ()) for item in resolution.members})
-            blocked = resolution.blocked
+            found = resolve_source(stage.entry, self._store, only=self._only.get(name), listing=self.listing)
+            stage.found = {item: unit for item, unit in found.items() if isinstance(unit, Unit)}
+            state.members.update((item, (item,)) for item in found)
+            notes = {item: unit.source.notes for item, unit in stage.found.items() if unit.source}
+            self._listener.source_listed(stage.entry, {item: notes.get(item, ()) for item in found})
+            blocked = {item: why for item, why in found.items() if isinstance(why, str)}
         else:
             members = stage.resolver.unit_names()
             assert members is not None, name
-            blocked = stage.resolver.resolution.blocked
+            blocked = stage.resolver.blocked
             # There may be a million members: a dict is not copied.
             state.members = members if isinstance(members, dict) else dict(members)
         stage.rank = _ranks(state.members, blocked)
@@ -185,7 +184,11 @@ class ReadyQueue:
         self._open_behind(name)
 
     def _wait(self, stage: _Stage, item: str) -> None:
-        tokens = {token for token in self._needs(stage, item) if not self._is_available(token)}
+        tokens = {
+            (name, unit)
+            for name, unit in self._needs(stage, item)
+            if (name not in self._complete if unit is None else unit in self.states[name].pending)
+        }
         if not tokens:
             heapq.heappush(self._ready, (stage.position, stage.rank[item], stage.entry.name, item))
             return
@@ -197,21 +200,14 @@ class ReadyQueue:
     def _needs(self, stage: _Stage, item: str) -> Iterator[Token]:
         for edge in stage.edges.values():
             producer, cardinality = edge.producer, edge.port.cardinality
-            if edge.exploded or cardinality in (Cardinality.ALL, Cardinality.NAMES) or self._has_threshold(producer):
+            policy = self._stages[producer].entry.policy
+            has_threshold = bool(policy.gate) or policy.min_success > 0  # what waits for it waits until it is reached
+            if edge.exploded or cardinality in (Cardinality.ALL, Cardinality.NAMES) or has_threshold:
                 yield producer, None
             elif cardinality is Cardinality.NEAR:
                 yield from ((producer, near) for near in stage.resolver.near[item])
             else:
                 yield producer, item if cardinality is Cardinality.EACH else WHOLE
-
-    def _has_threshold(self, name: str) -> bool:
-        """Return whether the stages behind a stage must wait until it has reached its thresholds."""
-        policy = self._stages[name].entry.policy
-        return bool(policy.gate) or policy.min_success > 0
-
-    def _is_available(self, token: Token) -> bool:
-        name, item = token
-        return name in self._complete if item is None else item not in self.states[name].pending
 
     def _block(self, stage: _Stage, item: str, reason: str) -> None:
         self.states[stage.entry.name].failed[item] = reason

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from sys import intern
 from typing import Any
@@ -16,7 +17,7 @@ from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
-from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
+from pano_mvs.engine.planning.units import PENDING, WHOLE, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, SourceItem
 from pano_mvs.engine.stages.stage_code import stage_code
@@ -133,8 +134,8 @@ KEY_SCHEMA = 3
 
 def resolve_source(
     entry: StageEntry, store: Store, *, only: frozenset[str] | None = None, listing: SourceListing | None = None
-) -> Resolution:
-    """List the items of a source, and return a unit for each.
+) -> dict[str, Unit | str]:
+    """List the items of a source, and return the unit of each, or the reason why the item cannot be used.
 
     Args:
         only: names of the items to return; None for all.
@@ -144,30 +145,27 @@ def resolve_source(
         InputError: if the list cannot be made, or names an item twice.
     """
     listing = listing or SourceListing()
-    resolution = Resolution()
+    found: dict[str, Unit | str] = {}
     static = _static_identity(entry, store)
     common = digest_from_value(static)
     for item in listing.items(entry):
         if only is not None and item.name not in only:
             continue
-        if item.name in resolution.members:
+        if item.name in found:
             raise InputError(f"{entry.name}: the item {item.name!r} is listed twice")
-        resolution.members[item.name] = (item.name,)
         if problem := item.problem or item_problem(item.name):
-            resolution.blocked[item.name] = problem
+            found[item.name] = problem
             continue
         try:
             digests = {role: listing.digest(path, store) for role, path in sorted(item.files.items())}
         except InputError as error:
-            resolution.blocked[item.name] = str(error)
+            found[item.name] = str(error)
             continue
         inputs = {"files": digests, "name": item.name, **({"links": list(item.links)} if item.links else {})}
         key = digest_from_value([common, inputs])
-        unit = Unit(
-            entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, replace(item, digests=digests)
-        )
-        resolution.units.append(unit)
-    return resolution
+        source = replace(item, digests=digests)
+        found[item.name] = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, source)
+    return found
 
 
 def resolve(
@@ -177,19 +175,33 @@ def resolve(
     states: Mapping[str, StageState],
     store: Store,
     listing: SourceListing | None = None,
-) -> tuple[Iterator[Unit], Resolution]:
-    """Return the units of a stage, given the states of the stages that feed it; see `resolve_source` for `listing`.
+) -> Iterator[Unit]:
+    """Yield the units of a stage whose inputs are all known, given the states of the stages that feed it.
 
-    Returns:
-        An iterator over the units whose inputs are all known, and a resolution that describes the others once the
-        iterator is exhausted. The units come one at a time because a stage may have a million of them, whose inputs
-        take more memory than everything else.
+    The other units are entered into the stage's own state. Units come one at a time because a stage may have a million
+    of them, whose inputs take more memory than everything else.
+
+    Args:
+        listing: see `resolve_source`.
     """
+    state = states[entry.name]
     if entry.spec.list_items is not None:
-        resolution = resolve_source(entry, store, only=graph.only.get(entry.name), listing=listing)
-        return iter(resolution.units), resolution
-    resolver = Resolver(entry, graph, states=states, store=store)
-    return resolver.resolve(), resolver.resolution
+        listed = resolve_source(entry, store, only=graph.only.get(entry.name), listing=listing)
+        units: Iterable[tuple[str, tuple[str, ...], Any]] = ((name, (name,), unit) for name, unit in listed.items())
+    else:
+        resolver = Resolver(entry, graph, states=states, store=store)
+        names = resolver.unit_names()
+        state.open = names is None
+        state.failed |= resolver.blocked
+        units = ((name, members, resolver.unit(name, members)) for name, members in (names or {}).items())
+    for name, members, unit in units:
+        state.members[name] = members
+        if isinstance(unit, Unit):
+            yield unit
+        elif unit is None:
+            state.pending.add(name)
+        else:
+            state.failed[name] = unit
 
 
 class Resolver:
@@ -202,32 +214,12 @@ class Resolver:
         self.only = graph.only.get(entry.name)
         self.states = states
         self.store = store
-        self.resolution = Resolution()
+        self.blocked: dict[str, str] = {}  # why there are no units, after `unit_names`, if its index failed
         # unit to its neighbours, if the stage has an index and its unit names are known
         self.near: Mapping[str, tuple[str, ...]] = {}
         self._static: dict[str, Any] = {}
         self._common = ""
         self._near_edges = [edge for edge in edges.values() if edge.port.cardinality is Cardinality.NEAR]
-
-    def resolve(self) -> Iterator[Unit]:
-        """Yield the units whose inputs are all known, and enter the others into `resolution`."""
-        names = self.unit_names()
-        if names is None:
-            self.resolution.open = True
-            return
-        for name, members in names.items():
-            self.resolution.members[name] = members
-            self._add(name, members)
-            if self.resolution.units:
-                yield self.resolution.units.pop()
-
-    def unit(self, name: str, members: tuple[str, ...]) -> Unit | str:
-        """Return a unit whose inputs are all settled, or the reason why it cannot run."""
-        self.resolution = Resolution()
-        self._add(name, members)
-        assert not self.resolution.waiting, name
-        # The unit is taken out, because that of a stage with All ports is large, and would be kept until the next one.
-        return self.resolution.units.pop() if self.resolution.units else self.resolution.blocked[name]
 
     def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
         """Return the units of the stage and the images that each concerns, or None if they are not known yet.
@@ -265,7 +257,7 @@ class Resolver:
     def _with_neighbours(self, names: dict[str, tuple[str, ...]]) -> Mapping[str, tuple[str, ...]] | None:
         """Return units of a stage for every image, after `near` has got each image in the index and its neighbours."""
         views = self._units_of_index(self.edges[INDEX_PORT])
-        if views is None or self.resolution.blocked:
+        if views is None or self.blocked:
             return views
         self.near = {name: (name, *self.near[name]) if name in views else () for name in names}
         return names
@@ -275,7 +267,7 @@ class Resolver:
         if state.pending or state.open:
             return None
         if WHOLE not in state.items:
-            self.resolution.blocked[WHOLE] = f"needs {edge.producer}, which failed"
+            self.blocked[WHOLE] = f"needs {edge.producer}, which failed"
             return {}
         index = self.store.load(state.items[WHOLE], edge.port.kind)
         assert isinstance(index, Pairs | Views)
@@ -285,7 +277,8 @@ class Resolver:
             return self.near
         return {name: (name,) for name in self.near}
 
-    def _add(self, name: str, members: tuple[str, ...]) -> None:
+    def unit(self, name: str, members: tuple[str, ...]) -> Unit | str | None:
+        """Return a unit, or the reason why it cannot run; None if its inputs are not known yet."""
         inputs: dict[str, UnitInput] = {}
         waiting = False
         for port in self.entry.spec.ports:
@@ -295,20 +288,18 @@ class Resolver:
                 continue
             value, problem, waits = self._input(edge, name)
             if problem:
-                self.resolution.blocked[name] = problem
-                return
+                return problem
             waiting |= waits
             inputs[port.name] = value
         if waiting:
-            self.resolution.waiting.append(name)
-            return
+            return None
         if not self._static:
             self._static = _static_identity(self.entry, self.store)
             self._common = digest_from_value(self._static)
         encoded = {port: self._encode(port, value) for port, value in inputs.items()}
         identity = self._static | {"inputs": encoded}
         key = digest_from_value([self._common, encoded])
-        self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
+        return Unit(self.entry, name, members, inputs, key, identity)
 
     def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
         """Return a unit's input at a port, the reason why there is none, and whether it is not known yet."""
@@ -320,7 +311,8 @@ class Resolver:
             case Cardinality.EACH:
                 wanted = (name,)
             case Cardinality.NEAR:
-                wanted = self._near(name)
+                # the neighbours that every Near port has or may still get, so that all ports agree
+                wanted = [item for item in self.near[name] if all(map(partial(self._may_have, item), self._near_edges))]
             case Cardinality.NAMES if not state.open and not edge.exploded:
                 # A plan assumes that pending units will succeed: their names are known, their values are not.
                 names = [item for item in state.members if item in items or item in state.pending]
@@ -348,11 +340,7 @@ class Resolver:
             return items[wanted[0]], "", False
         return None, self._why(edge, state, wanted[0]), False
 
-    def _near(self, name: str) -> list[str]:
-        """Return a unit's neighbours that every Near port has or may still get, so that all ports agree."""
-        return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self._near_edges)]
-
-    def _may_have(self, edge: Edge, item: str) -> bool:
+    def _may_have(self, item: str, edge: Edge) -> bool:
         state = self.states[edge.producer]
         if state.open or item in state.pending or (edge.exploded and state.pending):
             return True

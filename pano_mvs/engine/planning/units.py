@@ -55,18 +55,6 @@ class StageState:
     # image to its item, where the value is a collection
     exploded: dict[str, ItemRef] = field(default_factory=dict)
     members: dict[str, tuple[str, ...]] = field(default_factory=dict)  # unit to the images that it concerns
-    failed: dict[str, str] = field(default_factory=dict)  # unit to the reason why it has no value
+    failed: dict[str, str] = field(default_factory=dict)  # unit to the reason why it has, or can have, no value
     pending: set[str] = field(default_factory=set)  # units that are not settled
     open: bool = False  # whether the list of units is not known yet
-
-
-@dataclass(slots=True)
-class Resolution:
-    """The units of a stage."""
-
-    units: list[Unit] = field(default_factory=list)  # units whose inputs all exist
-    # unit to the reason why it cannot run, such as an input that failed
-    blocked: dict[str, str] = field(default_factory=dict)
-    waiting: list[str] = field(default_factory=list)  # units whose inputs are not known yet (plans only)
-    open: bool = False  # whether the list of units is not known yet (plans only)
-    members: dict[str, tuple[str, ...]] = field(default_factory=dict)  # unit to the images that it concerns

@@ -18,7 +18,7 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.unit_json import has_large_inputs
+from pano_mvs.engine.executors.unit_requests import has_large_inputs
 from pano_mvs.engine.planning.units import PENDING, Unit
 from pano_mvs.scene import Record
 

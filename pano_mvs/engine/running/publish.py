@@ -238,13 +238,13 @@ class Publisher:
         if there == blob.digest:
             return
         self.store.blobs.verified_place(blob)
-        if there and there != self.earlier.get(name) and not self._is_stored(target, there, blob.suffix):
+        is_ours = there in ("", self.earlier.get(name)) or self.store.blobs.exists(
+            BlobRef(there, target.stat().st_size, blob.suffix)
+        )
+        if not is_ours:
             self.set_aside[name] = set_aside(target).relative_to(self.out).as_posix()
         self.store.blobs.copy(blob, target)
         self.written.append(name)
-
-    def _is_stored(self, path: Path, digest: str, suffix: str) -> bool:
-        return self.store.blobs.exists(BlobRef(digest, path.stat().st_size, suffix))
 
 
 def _cannot_write(path: Path, reason: str) -> str:

@@ -152,7 +152,11 @@ class RunStatistics:
         summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
         notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
-        summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
+        total = len(state.items)
+        summary.notes = [
+            note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
+            for note, units in Counter(notes).items()
+        ]
         self._observer(summary.event())
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:10])
@@ -205,11 +209,6 @@ class RunStatistics:
         for name in (summary.name for summary in result.stages):
             enter(name, self._counts[name].rejected, result.rejected)
             enter(name, {} if name in replaced else self._counts[name].doubts, result.doubts)
-
-
-def _counted(note: str, units: int, total: int) -> str:
-    """Return a note with the number of units that gave it, if it asks for that; see `Context.note`."""
-    return note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
 
 
 _positions: dict[tuple[str, ...], tuple[dict[str, int], Struct]] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -81,15 +81,29 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     paths: dict[str, list[Path]] = {}
     dumped = params.model_dump(mode="json")
     for name, field in type(params).model_fields.items():
-        marks = field.metadata
+        marks = {type(mark) for mark in _marks(field.annotation, field.metadata)}
         value = getattr(params, name)
-        if _is_marked(field.annotation, marks, _NotInKey):
+        if _NotInKey in marks:
             continue
-        if _is_marked(field.annotation, marks, _KeyedByContent) and value is not None:
+        if _KeyedByContent in marks and value is not None:
             paths[name] = _paths_in(value)
         else:
             plain[name] = dumped[name]
     return plain, paths
+
+
+def json_settings(params: Params, place: Callable[[Path], Path]) -> dict[str, Any]:
+    """Return settings as JSON values, with another path in the place of each."""
+    values = {name: _placed(getattr(params, name), place) for name in type(params).model_fields}
+    return type(params).model_construct(**values).model_dump(mode="json", by_alias=True)
+
+
+def _placed(value: Any, place: Callable[[Path], Path]) -> Any:
+    if isinstance(value, Path):
+        return place(value)
+    if isinstance(value, dict):
+        return {key: _placed(inner, place) for key, inner in value.items()}
+    return type(value)(_placed(inner, place) for inner in value) if isinstance(value, list | tuple) else value
 
 
 def registered_files(params: Params) -> dict[str, Path]:
@@ -106,7 +120,7 @@ def files_of(params: Params) -> dict[str, list[Path]]:
     """Return each setting that names input files or folders, with their paths."""
     found: dict[str, list[Path]] = {}
     for name, field in type(params).model_fields.items():
-        if _names_files(field.annotation, field.metadata):
+        if any(getattr(mark, "func", None) is _resolve for mark in _marks(field.annotation, field.metadata)):
             found[name] = _paths_in(getattr(params, name))
     return found
 
@@ -120,19 +134,12 @@ def _paths_in(value: Any) -> list[Path]:
     return [path for item in value or () for path in _paths_in(item)]
 
 
-def _names_files(annotation: Any, marks: list[Any]) -> bool:
-    if any(isinstance(mark, AfterValidator) and mark.func is _resolve for mark in marks):
-        return True
-    inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]
-    return any(_names_files(part, [part]) for part in inner)
-
-
-def _is_marked(annotation: Any, marks: list[Any], mark_type: type[_NotInKey | _KeyedByContent]) -> bool:
-    """Return whether a field has a mark, on itself or inside a type such as `InputPath | None`."""
-    if any(isinstance(mark, mark_type) for mark in marks):
-        return True
-    inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]
-    return any(isinstance(part, mark_type) or _is_marked(part, [], mark_type) for part in inner)
+def _marks(annotation: Any, marks: Sequence[Any] = ()) -> Iterator[Any]:
+    """Yield the marks of a setting, on itself or inside a type such as `InputPath | None`."""
+    yield from marks
+    for part in (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())):
+        yield part
+        yield from _marks(part)
 
 
 Model = TypeVar("Model", bound=Params)

@@ -108,7 +108,8 @@ class Registry:
             raise
         except BaseException as error:  # also others than Exception, such as pytest.skip() or a panic in Rust
             raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
-        if not any(_specs(module, own_only=True)) and not any(_registrations(module, own_only=False)):
+        registered = any(kind != "stage" for kind, _ in _names(module, own_only=False))
+        if not registered and not _names(module, own_only=True):
             raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
         return module, digest
 
@@ -174,22 +175,21 @@ class Registry:
         """Return the names of a module that are defined elsewhere too, with both places."""
         places = {key: found.origin for key, found in self.registrations.items()}
         places |= {("stage", name): spec.origin for name, spec in self.stages.items()}
-        given = [((found.kind, found.name), found.origin) for found in _registrations(module, own_only=own_only)]
-        given += [(("stage", spec.name), spec.origin) for spec in _specs(module, own_only=own_only)]
         clashes: dict[tuple[str, str], str] = {}
-        for (kind, name), origin in given:
-            taken = places.setdefault((kind, name), origin)
-            if taken != origin:
-                clashes[kind, name] = f"{kind} {name!r} is defined twice: {taken} and {origin}. Rename one of them"
+        for (kind, name), found in _defined(module, own_only=own_only):
+            taken = places.setdefault((kind, name), found.origin)
+            if taken != found.origin:
+                both = f"{taken} and {found.origin}"
+                clashes[kind, name] = f"{kind} {name!r} is defined twice: {both}. Rename one of them"
         return clashes
 
     def _add(self, module: ModuleType, origin: str, code: str) -> None:
-        for found in _registrations(module, own_only=bool(code)):
-            self.registrations.setdefault((found.kind, found.name), found)
-        for spec in _specs(module, own_only=bool(code)):
-            if spec.name not in self.stages:
-                self.stages[spec.name] = spec.with_code(code) if code else spec
-                self.origins[spec.name] = origin
+        for key, found in _defined(module, own_only=bool(code)):
+            if isinstance(found, Registration):
+                self.registrations.setdefault(key, found)
+            elif found.name not in self.stages:
+                self.stages[found.name] = found.with_code(code) if code else found
+                self.origins[found.name] = origin
 
     def _withhold(self) -> None:
         """Remove names that are defined twice, and state why others may be missing."""
@@ -216,25 +216,23 @@ def _trace(error: BaseException) -> str:
 
 def _names(module: ModuleType, *, own_only: bool) -> tuple[tuple[str, str], ...]:
     """Return the names that a module defines; see `Plugin.names`."""
-    stages = [("stage", spec.name) for spec in _specs(module, own_only=own_only)]
-    return tuple(
-        dict.fromkeys([*stages, *((found.kind, found.name) for found in _registrations(module, own_only=own_only))])
-    )
+    return tuple(dict.fromkeys(key for key, _ in _defined(module, own_only=own_only)))
 
 
-def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
-    """Yield the stages of a module; with `own_only` not those that it imports."""
+def _defined(module: ModuleType, *, own_only: bool) -> Iterator[tuple[tuple[str, str], StageSpec | Registration]]:
+    """Yield the stages of a module, then what it registers beside them, with kind and name; see `Plugin.names`.
+
+    Args:
+        own_only: whether to leave out what it imports.
+    """
     for value in vars(module).values():
         spec = spec_of(value)
         if spec is not None and (not own_only or spec.function.__module__ == module.__name__):
-            yield spec
-
-
-def _registrations(module: ModuleType, *, own_only: bool) -> Iterator[Registration]:
-    """Yield what a module registers beside stages; with `own_only` not what it imports."""
+            yield ("stage", spec.name), spec
     for value in vars(module).values():
         if not own_only or getattr(value, "__module__", "") == module.__name__:
-            yield from registrations_of(value)
+            for found in registrations_of(value):
+                yield (found.kind, found.name), found
 
 
 def _import_file(path: Path) -> ModuleType:

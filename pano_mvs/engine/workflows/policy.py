@@ -58,35 +58,27 @@ class Policy(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     use: str = Field(description="name of the stage; `pano-mvs plugins` lists all")
-    # `in:`, port to the stage of this workflow that feeds it
     inputs: dict[str, str] = Field(
         default={},
         alias="in",
         description="port to the stage of this workflow that feeds it, if there are several candidates",
     )
-    # `skip` reports a failed unit and goes on, `stop` ends the run
     on_error: Literal["skip", "stop"] = Field(
         default="skip", description="skip: report a failed unit and go on; stop: end the run"
     )
-    # further attempts for a failed unit
     retries: int = Field(default=0, ge=0, le=100, description="further attempts for a unit that failed")
-    # share of units that must succeed; otherwise the run stops with exit code 4
     min_success: float = Field(
         default=0.0, ge=0, le=1, description="share of units that must succeed; otherwise the run stops"
     )
-    # metric to its thresholds; outside them the run stops with exit code 4. A number is the minimum.
     gate: dict[str, Thresholds] = Field(
         default={}, description="metric to its minimum, or to {min: …, max: …}; outside the run stops"
     )
-    # time in seconds after which a unit is ended and counts as failed; 0 for no limit
     timeout_s: float = Field(
         default=0.0, ge=0, le=1e9, description="seconds after which a unit is ended and counts as failed; 0: no limit"
     )
-    # memory that one unit needs, such as `2GB`; only as many units run at a time as fit into free memory
     memory: str | int = Field(
         default=0, description="memory that one unit needs, such as 2GB; only as many units run at a time as fit"
     )
-    # folder for the stage's files, inside the output folder
     to: str = Field(default="", description="folder for the stage's files, inside the output folder")
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from io import StringIO
-from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -11,6 +10,7 @@ from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from pano_mvs.core.paths import resolved
+from pano_mvs.engine.stages.params import json_settings
 from pano_mvs.engine.workflows.extends import FORMAT_VERSION
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
@@ -42,23 +42,9 @@ def _entry(entry: StageEntry, graph: Graph) -> dict[str, Any]:
     ports = {port: edge.producer for port, edge in graph.edges[entry.name].items()}
     policy = entry.policy.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     found: dict[str, Any] = {"use": entry.spec.name} | ({"in": ports} if ports else {})
-    found |= _with_absolute_paths(entry)
+    found |= json_settings(entry.params, resolved)
     found |= {key: value for key, value in policy.items() if key not in _FIRST_KEYS}
     return found
-
-
-def _with_absolute_paths(entry: StageEntry) -> dict[str, Any]:
-    """Return the settings of a stage as JSON values."""
-    values = {name: _absolute(getattr(entry.params, name)) for name in type(entry.params).model_fields}
-    return type(entry.params).model_construct(**values).model_dump(mode="json", by_alias=True)
-
-
-def _absolute(value: Any) -> Any:
-    if isinstance(value, Path):
-        return resolved(value)
-    if isinstance(value, dict):
-        return {key: _absolute(inner) for key, inner in value.items()}
-    return type(value)(map(_absolute, value)) if isinstance(value, list | tuple) else value
 
 
 def _commented(value: Any) -> Any:

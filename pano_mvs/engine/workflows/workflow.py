@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
@@ -116,7 +116,8 @@ class WorkflowReader:
         root = files[-1].root
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
-        return Workflow(name, path, _all_texts(files), stages, tuple(shown), self.plugins)
+        below = (f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in files[:-1])
+        return Workflow(name, path, "".join([files[-1].text, *below]), stages, tuple(shown), self.plugins)
 
     def inherited(self, text: str, path: Path) -> dict[str, Located]:
         """Return the stages that a file inherits, and load the plugins of all its files.
@@ -215,9 +216,8 @@ class WorkflowReader:
         try:
             return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
-            report_invalid(
-                error, node, self.problems, subject=f"stage {name!r}: ", known=(*_keys(model), *RESERVED_KEYS)
-            )
+            keys = (info.alias or key for key, info in model.model_fields.items())
+            report_invalid(error, node, self.problems, subject=f"stage {name!r}: ", known=(*keys, *RESERVED_KEYS))
             return None
 
     def _bases(self, node: Located) -> dict[str, Path]:
@@ -225,19 +225,10 @@ class WorkflowReader:
         return {key: self._folder(item) for key, item in node.value.items()}
 
 
-def _keys(model: type[BaseModel]) -> list[str]:
-    return [info.alias or name for name, info in model.model_fields.items()]
-
-
 def _name_of(shown_as: str) -> str:
     """Return the name of a workflow that states none, from its file."""
     word = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in Path(shown_as).stem)
     return word if is_plain_name(word) else "workflow"
-
-
-def _all_texts(files: Sequence[WorkflowFile]) -> str:
-    *below, own = files
-    return own.text + "".join(f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in below)
 
 
 def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
@@ -285,7 +276,9 @@ def apply_overrides(
     rest: list[_Override] = []
     for override in filter(None, (_read(text, problems) for text in overrides)):
         if override.target == "plugins":
-            plugins.extend(_items(override.value))
+            value = override.value
+            items = value.value if isinstance(value.value, list) else [value]
+            plugins.extend(Located(item.value, 0, 0, origin=value.origin) for item in items)
         elif _stage_of(override.target, stages) == override.target:
             if override.value.value is None:
                 del stages[override.target]
@@ -324,11 +317,6 @@ def _stage_of(target: str, stages: dict[str, Located]) -> str:
     """Return the stage that a target begins with, the longest match as names may contain dots; empty if none."""
     found = [name for name in stages if target == name or target.startswith(f"{name}.")]
     return max(found, key=len, default="")
-
-
-def _items(value: Located) -> list[Located]:
-    items = value.value if isinstance(value.value, list) else [value]
-    return [Located(item.value, 0, 0, origin=value.origin) for item in items]
 
 
 def _replace(stages: dict[str, Located], override: _Override) -> None:

@@ -24,7 +24,7 @@ from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.executors.queues import read_queue
-from pano_mvs.engine.planning.forecast import expected_memory
+from pano_mvs.engine.planning.forecast import Experience, expected_memory
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import files_of
 from pano_mvs.io.images.captures import list_pictures
@@ -361,7 +361,7 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
     workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
 
     def needed(images: int) -> tuple[float, str]:
-        found = expected_memory(workflow, graph, size=CaptureSize(images, pixels), histories=histories, threads=1)
+        found = expected_memory(workflow, graph, Experience(CaptureSize(images, pixels), histories))
         return max(((needed_bytes, stage) for stage, needed_bytes in found.items()), default=(0.0, ""))
 
     count = len(pictures)

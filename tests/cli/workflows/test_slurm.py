@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.conftest import SMALL, deliverables
-from tests.cli.workflows.test_executors_agree import stored
+from tests.cli.workflows.test_equivariance import stored
 
 CONFIGURATION = """\
 ClusterName=test

@@ -110,7 +110,7 @@ def test_quota_is_a_full_disk_too(toy: Toy, monkeypatch: pytest.MonkeyPatch, num
 def test_library_that_tells_of_a_full_disk_in_its_own_words_is_understood(
     toy: Toy, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'    """Multiply."""\n    raise {how}'))
+    toy.begin(f"raise {how}")
     code, said = run(toy)
     assert (code, "cannot write" in said or "requested" in said) == (3, True)
     monkeypatch.setattr(disk_guard, "_FULL_BELOW_BYTES", 1 << 60)

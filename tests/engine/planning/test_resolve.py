@@ -13,7 +13,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.planning.resolve import KEY_SCHEMA, resolve, resolve_source
-from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit
+from pano_mvs.engine.planning.units import PENDING, WHOLE, StageState, Unit
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.scene import Axis, Pairs, Record, Views
@@ -37,6 +37,14 @@ def images(*names: str, pending: str = "", failed: str = "") -> StageState:
 OPEN = StageState(Axis.IMAGE, open=True)
 
 
+class Rest:
+    """The units that do not run."""
+
+    def __init__(self, state: StageState) -> None:
+        self.members, self.blocked, self.open = state.members, state.failed, state.open
+        self.waiting = [name for name in state.members if name in state.pending]
+
+
 class Resolved:
     """A toy workflow with another stage at its end, of which states are put in by hand."""
 
@@ -56,10 +64,11 @@ class Resolved:
 
     def __call__(
         self, stage: str, only: Mapping[str, frozenset[str]] | None = None, **states: StageState
-    ) -> tuple[dict[str, Unit], Resolution]:
-        graph = replace(self.session.graph, only=only or {})
-        units, resolution = resolve(self.session.workflow.stages[stage], graph, states=states, store=self.store)
-        return {unit.item: unit for unit in units}, resolution
+    ) -> tuple[dict[str, Unit], Rest]:
+        graph, own = replace(self.session.graph, only=only or {}), StageState(Axis.ONE)
+        known = states | {stage: own}
+        found = resolve(self.session.workflow.stages[stage], graph, states=known, store=self.store)
+        return {unit.item: unit for unit in found}, Rest(own)
 
 
 @pytest.fixture
@@ -252,32 +261,35 @@ def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> N
     assert again["c"].key == again["a"].key == units["a"].key != units["b"].key
 
 
-def sources(toy: Toy, *items: SourceItem, only: frozenset[str] | None = None) -> tuple[dict[str, Unit], Resolution]:
+def sources(toy: Toy, *items: SourceItem, only: frozenset[str] | None = None) -> tuple[dict[str, Unit], dict[str, str]]:
+    """Return the units of a source, and why its other items cannot be used."""
     entry = toy.session().workflow.stages["images"]
     spec = replace(entry.spec, list_items=lambda _: items)
     found = resolve_source(replace(entry, spec=spec), Store(toy.folder / "cache"), only=only)
-    return {unit.item: unit for unit in found.units}, found
+    assert list(found) == [item.name for item in items if only is None or item.name in only]
+    units = {name: unit for name, unit in found.items() if isinstance(unit, Unit)}
+    return units, {name: why for name, why in found.items() if isinstance(why, str)}
 
 
 def test_a_source_s_units_are_known_by_name_and_content(toy: Toy) -> None:
     paths = [toy.folder / "capture" / f"{number}.txt" for number in (1, 2)]
     first, second = (SourceItem(name, {"text": path}) for name, path in zip("ab", paths, strict=True))
-    units, found = sources(toy, first, second)
+    units, _ = sources(toy, first, second)
     digests = {name: unit.identity["inputs"]["files"]["text"] for name, unit in units.items()}
     assert units["a"].identity["inputs"] == {"files": {"text": digests["a"]}, "name": "a"}
     assert digests["a"] != digests["b"]
     assert units["a"].source == replace(first, digests={"text": digests["a"]})
-    assert (units["a"].inputs, units["a"].members, found.members) == ({}, ("a",), {"a": ("a",), "b": ("b",)})
+    assert (units["a"].inputs, units["a"].members) == ({}, ("a",))
     renamed, _ = sources(toy, replace(first, name="c"))
     assert renamed["c"].key != units["a"].key
-    only, rest = sources(toy, first, second, only=frozenset({"b"}))
-    assert list(only) == list(rest.members) == ["b"]
+    only, _ = sources(toy, first, second, only=frozenset({"b"}))
+    assert list(only) == ["b"]
     assert only["b"].key == units["b"].key
 
 
 def test_items_of_a_source_that_cannot_be_used_are_blocked(toy: Toy) -> None:
     path = toy.folder / "capture" / "1.txt"
-    units, found = sources(
+    units, blocked = sources(
         toy,
         SourceItem("a", {"text": path}, problem="too dark"),
         SourceItem("b", {"text": path.with_name("gone")}),
@@ -285,11 +297,10 @@ def test_items_of_a_source_that_cannot_be_used_are_blocked(toy: Toy) -> None:
         SourceItem("d | e", {"text": path}),
     )
     assert list(units) == ["c"]
-    assert list(found.members) == ["a", "b", "c", "d | e"]
-    assert found.blocked.keys() == {"a", "b", "d | e"}
-    assert found.blocked["a"] == "too dark"
-    assert "gone: cannot be read" in found.blocked["b"]
-    assert "contains ' | ', which separates the names of a pair" in found.blocked["d | e"]
+    assert blocked.keys() == {"a", "b", "d | e"}
+    assert blocked["a"] == "too dark"
+    assert "gone: cannot be read" in blocked["b"]
+    assert "contains ' | ', which separates the names of a pair" in blocked["d | e"]
     with pytest.raises(InputError, match="images: the item 'a' is listed twice"):
         sources(toy, *[SourceItem("a", {"text": path})] * 2)
 

@@ -125,16 +125,11 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
 
 def test_unit_whose_process_dies_is_tried_again(toy: Toy) -> None:
     mark = toy.folder / "died"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            f'''    """Multiply."""
-    if x.value == 30 and not os.path.exists({str(mark)!r}):
-        open({str(mark)!r}, "w").close()
-        os._exit(1)''',
-        ),
-    )
+    toy.begin(f"""
+if x.value == 30 and not os.path.exists({str(mark)!r}):
+    open({str(mark)!r}, "w").close()
+    os._exit(1)
+""")
     assert ran(run_with(toy, lambda store: DaskExecutor(store, workers=2, threads=1))) == ALL_UNITS
     assert mark.exists()
 

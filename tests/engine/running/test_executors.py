@@ -18,13 +18,13 @@ import pytest
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors import choose, unit_json
+from pano_mvs.engine.executors import choose, unit_requests
 from pano_mvs.engine.executors import processes as worker_process
 from pano_mvs.engine.executors.choose import SerialExecutor, make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
-from pano_mvs.engine.executors.unit_json import unit_from_json, unit_to_json, write_large_inputs
+from pano_mvs.engine.executors.unit_requests import unit_from_json, unit_to_json, write_large_inputs
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.run import Run
@@ -111,17 +111,15 @@ def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
 def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
     seen = toy.folder / "seen"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Read a number."""',
-            f'''    """Read a number."""
-    import pathlib
-    while item.name == "5.txt" and not pathlib.Path({str(seen)!r}).exists(): time.sleep(0.01)''',
-        ),
+    toy.begin(
+        f"""
+import pathlib
+while item.name == "5.txt" and not pathlib.Path({str(seen)!r}).exists(): time.sleep(0.01)
+""",
+        of="Read a number.",
     )
     touch = f"import pathlib; pathlib.Path({str(seen)!r}).touch()"
-    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', f'"""Multiply."""\n    {touch}'))
+    toy.begin(touch)
     result = run_with(toy, two_processes, "images.timeout_s=60")
     assert result.exit_code == 0
     assert ran(result) == ALL_UNITS
@@ -132,17 +130,13 @@ def kill_once(
 ) -> None:
     """Let the worker that multiplies a certain number die the first time; `of` is the docstring of another stage."""
     mark = toy.folder / "died"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            f'    """{of}"""',
-            f'''    """{of}"""
-    import pathlib
-    if {when} and not pathlib.Path({str(mark)!r}).exists():
-        pathlib.Path({str(mark)!r}).touch()
-        {how}''',
-        ),
-    )
+    code = f"""
+import pathlib
+if {when} and not pathlib.Path({str(mark)!r}).exists():
+    pathlib.Path({str(mark)!r}).touch()
+    {how}
+"""
+    toy.begin(code, of=of)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
@@ -168,7 +162,7 @@ def test_many_inputs_reach_workers_through_a_file(toy: Toy, monkeypatch: pytest.
         written.append([len(json.loads(line)["many"]) for line in path.read_text().splitlines()])
 
     for name, value in {"LARGE_INPUT": 3, "_ITEMS_PER_LINE": 2, "write_large_inputs": write}.items():
-        monkeypatch.setattr(unit_json, name, value)
+        monkeypatch.setattr(unit_requests, name, value)
     side_by_side = run_with(toy, two_processes, name="processes")
     assert written == [[2, 2, 1], [2, 2, 1], [2, 2]]
     assert told(side_by_side) == told(serial)
@@ -185,7 +179,7 @@ def test_the_files_of_the_user_among_many_inputs_reach_workers(toy: Toy, monkeyp
     code = stage_code(entry.spec, entry.params)
     identity = {"code": code.digest, "libraries": dict(code.libraries), "inputs": {"xs": list(xs)}}
     unit = Unit(entry, "", (), {"xs": xs}, "1" * 32, identity)
-    monkeypatch.setattr(unit_json, "LARGE_INPUT", 1)
+    monkeypatch.setattr(unit_requests, "LARGE_INPUT", 1)
     write_large_inputs(unit, store, toy.folder / "cache" / "tmp" / "x.inputs")
     message = unit_to_json(unit, store, inputs_file=toy.folder / "cache" / "tmp" / "x.inputs")
     assert message["external"] == {}
@@ -201,15 +195,10 @@ def test_the_files_of_the_user_among_many_inputs_reach_workers(toy: Toy, monkeyp
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: Toy) -> None:
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            '''    """Multiply."""
-    print("about to go")
-    if x.value == 30: os.kill(os.getpid(), 9)''',
-        ),
-    )
+    toy.begin("""
+print("about to go")
+if x.value == 30: os.kill(os.getpid(), 9)
+""")
     result = run_with(toy, two_processes)
     assert result.exit_code == 3
     failure = next(f for f in result.failures if f.stage == "scaled")
@@ -222,15 +211,10 @@ def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: To
 @pytest.mark.parametrize(("how", "cause"), [("os._exit(0)", "exit code 0"), ("os.abort()", "killed by SIGABRT")])
 def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: str, cause: str) -> None:
     """One worker was no process: os._exit(0) in a stage ended the run with exit code 0 and without a report."""
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            f'''    """Multiply."""
-    if x.value == 30:
-        {how}''',
-        ),
-    )
+    toy.begin(f"""
+if x.value == 30:
+    {how}
+""")
     result = run_with(toy, lambda store: make_executor(store, workers=1, threads=1))
     (failure,) = (f for f in result.failures if f.stage == "scaled")
     assert (failure.item, result.exit_code) == ("3.txt", 3)
@@ -266,7 +250,7 @@ def test_the_log_of_a_process_that_died_is_named_if_it_holds_anything(
 
 @pytest.mark.slow
 def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -> None:
-    exits = "import os, sys\nif 'pano_mvs.engine.executors.worker' in sys.modules: os._exit(0)\n"
+    exits = "import os\nif 'PANO_MVS_WORKER' in os.environ: os._exit(0)\n"
     toy.edit("plug.py", lambda text: exits + text)
     with pytest.raises(InputError, match=r"(?s)none of the 5 items.*its worker process died \(exit code 0\)"):
         run_with(toy, two_processes)
@@ -274,18 +258,13 @@ def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -
 
 @pytest.mark.parametrize("make", [SerialExecutor, one_process])
 def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make) -> None:
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            '''    """Multiply."""
-    if x.value in (kinds := {20: BaseException, 30: Exception, 40: SystemExit}):
-        class Odd(kinds[x.value]):
-            def __str__(self):
-                return 1 / 0
-        raise Odd''',
-        ),
-    )
+    toy.begin("""
+if x.value in (kinds := {20: BaseException, 30: Exception, 40: SystemExit}):
+    class Odd(kinds[x.value]):
+        def __str__(self):
+            return 1 / 0
+    raise Odd
+""")
     result = run_with(toy, make)
     failures = {failure.item: failure.cause for failure in result.failures if failure.stage == "scaled"}
     assert failures.keys() == {"2.txt", "3.txt", "4.txt"}
@@ -392,16 +371,11 @@ def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
 @pytest.mark.slow
 def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
     count = toy.folder / "count"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            f'''    """Multiply."""
-    if x.value == 30:
-        with open({str(count)!r}, "a") as file: file.write("x")
-        raise ValueError("again")''',
-        ),
-    )
+    toy.begin(f"""
+if x.value == 30:
+    with open({str(count)!r}, "a") as file: file.write("x")
+    raise ValueError("again")
+""")
     assert run_with(toy, two_processes, "scaled.retries=2").exit_code == 3
     assert count.read_text() == "xxx"
 
@@ -409,15 +383,13 @@ def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
 @pytest.mark.slow
 def test_declared_memory_bounds_how_many_run_at_a_time(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     log = toy.folder / "log"
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Mean of the neighbours and the own."""',
-            f'''    """Mean of the neighbours and the own."""
-    with open({str(log)!r}, "a") as file: file.write("+")
-    time.sleep(0.05)
-    with open({str(log)!r}, "a") as file: file.write("-")''',
-        ),
+    toy.begin(
+        f"""
+with open({str(log)!r}, "a") as file: file.write("+")
+time.sleep(0.05)
+with open({str(log)!r}, "a") as file: file.write("-")
+""",
+        of="Mean of the neighbours and the own.",
     )
     monkeypatch.setattr(ProcessExecutor, "free_memory_bytes", lambda self: 3_000_000_000)
     result = run_with(toy, lambda store: ProcessExecutor(store, workers=3, threads=1), "mean.memory=2GB")
@@ -450,25 +422,20 @@ def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.
     )
     result = run_with(toy, SerialExecutor)
     refused = [failure for failure in result.failures if failure.stage == "mean"]
-    assert all("declares 2 MB of memory, and 1 MB are free" in failure.cause for failure in refused)
+    assert all("declares 2.0 MB of memory, and 1.0 MB are free" in failure.cause for failure in refused)
     assert 0 < len(refused) < 5
     assert not run_with(toy, SerialExecutor, "mean.memory=1MB", name="y").failures
 
 
 def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            '''    """Multiply."""
-    import ctypes, logging, sys
-    print("from Python")
-    sys.stderr.write("to the error stream\\n")
-    logging.getLogger("toy").info("from logging")
-    os.write(2, b"from a descriptor\\n")
-    ctypes.CDLL(None).puts(b"from C")''',
-        ),
-    )
+    toy.begin("""
+import ctypes, logging, sys
+print("from Python")
+sys.stderr.write("to the error stream\\n")
+logging.getLogger("toy").info("from logging")
+os.write(2, b"from a descriptor\\n")
+ctypes.CDLL(None).puts(b"from C")
+""")
     for name, make in {"serial": SerialExecutor, "processes": one_process}.items():
         assert run_with(toy, make, name=name).exit_code == 0
         text = (toy.folder / f"out-{name}" / "logs" / "scaled" / "3.txt.log").read_text()
@@ -540,15 +507,10 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
 
 def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     """An error in the middle ends the units in flight and the processes."""
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '    """Multiply."""',
-            '''    """Multiply."""
-    if x.value == 10: raise ValueError("stop here")
-    time.sleep(3600)''',
-        ),
-    )
+    toy.begin("""
+if x.value == 10: raise ValueError("stop here")
+time.sleep(3600)
+""")
     before = threading.active_count()
     assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
     deadline = time.monotonic() + 30  # the threads that read from the workers end by themselves
@@ -561,7 +523,7 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
 def test_same_work_twice_is_done_once(toy: Toy) -> None:
     """Two pictures of the same content have the same key; side by side they must not both be computed."""
     shutil.copy(toy.folder / "capture" / "1.txt", toy.folder / "capture" / "0.txt")
-    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.05)'))
+    toy.begin("time.sleep(0.05)")
     serial = run_with(toy, SerialExecutor, name="serial")
     side_by_side = run_with(toy, two_processes, name="processes")
     assert told(side_by_side) == told(serial)

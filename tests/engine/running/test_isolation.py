@@ -34,12 +34,6 @@ from tests.engine.running.test_run import ALL_UNITS
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 
 
-def edit(toy: Toy, code: str) -> None:
-    """Put code at the beginning of the stage that multiplies."""
-    lines = "\n".join(f"    {line}" for line in code.splitlines())
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'    """Multiply."""\n{lines}'))
-
-
 def ended(pids: Path) -> bool:
     """Return whether all processes whose ids are in a file have ended, within some seconds."""
     numbers = [int(line) for line in pids.read_text().split()]
@@ -57,14 +51,11 @@ def ended(pids: Path) -> bool:
 def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_import: bool) -> None:
     """A plugin that switched OpenCV's optimisation off changed 12 of 12 files of built-in stages, with exit 0."""
     clean = run_with(toy, SerialExecutor, name="clean")
-    edit(
-        toy,
-        """import cv2
+    toy.begin("""import cv2
 import numpy as np
 if not cv2.useOptimized() or np.geterr()["over"] == "raise": raise ValueError("tainted")
 cv2.setUseOptimized(False)
-np.seterr(over="raise")""",
-    )
+np.seterr(over="raise")""")
     if at_import:
         change = "import cv2\ncv2.setUseOptimized(False)\nimport time"
         toy.edit("plug.py", lambda text: text.replace("import time", change, 1))
@@ -107,13 +98,10 @@ def test_a_forked_child_neither_stores_nor_answers(toy: Toy) -> None:
     """Units got the results of other units, since a forked child of the stage answered too, or failed."""
     clean = run_with(toy, SerialExecutor, name="clean")
     pids = toy.folder / "pids"
-    edit(
-        toy,
-        f"""if (child := os.fork()) == 0:
+    toy.begin(f"""if (child := os.fork()) == 0:
     if x.value > 30: raise ValueError("child")
     return Number(666.0)
-open({str(pids)!r}, "a").write(f"{{child}} ")""",
-    )
+open({str(pids)!r}, "a").write(f"{{child}} ")""")
     result = run_with(toy, two_processes)
     assert told(result) == told(clean)
     assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
@@ -125,14 +113,11 @@ open({str(pids)!r}, "a").write(f"{{child}} ")""",
 def test_a_timeout_ends_what_the_unit_started(toy: Toy, child: str) -> None:
     """A child that held the pipe of the worker made the run wait for it for ever."""
     pids = toy.folder / "pids"
-    edit(
-        toy,
-        f"""import subprocess
+    toy.begin(f"""import subprocess
 if x.value == 20:
     {child}
     open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
-    time.sleep(600)""",
-    )
+    time.sleep(600)""")
     result = run_with(toy, two_processes, "scaled.timeout_s=3")
     assert [(failure.stage, failure.item) for failure in result.failures if "timeout_s: 3" in failure.cause] == [
         ("scaled", "2.txt")
@@ -143,14 +128,11 @@ if x.value == 20:
 @pytest.mark.slow
 def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> None:
     pids = toy.folder / "pids"
-    edit(
-        toy,
-        f"""if x.value == 20:
+    toy.begin(f"""if x.value == 20:
     if os.fork() == 0:
         open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
         time.sleep(600)
-    os._exit(3)""",
-    )
+    os._exit(3)""")
     result = run_with(toy, two_processes)
     assert ["its worker process died (exit code 3)" in failure.cause for failure in result.failures][:1] == [True]
     assert ended(pids)
@@ -159,7 +141,7 @@ def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> Non
 @pytest.mark.slow
 def test_isolated_units_have_processes_of_their_own(toy: Toy) -> None:
     pids = toy.folder / "pids"
-    edit(toy, f'open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")')
+    toy.begin(f'open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")')
     session = toy.session(cache=toy.folder / "cache-x")
     store = Store(session.store_root)
     options = RunOptions(until=("scaled",), isolate=True)
@@ -207,7 +189,7 @@ open({str(pids)!r}, "a").write(f"{{child.pid}} ")"""
     lines = (
         f"{daemon if way == 'daemon' else command}\nwhile not os.path.exists({str(pids)!r}): time.sleep(0.01)\n{then}"
     )
-    edit(toy, "if x.value == 20:\n" + "\n".join(f"    {line}" for line in lines.splitlines()))
+    toy.begin("if x.value == 20:\n" + "\n".join(f"    {line}" for line in lines.splitlines()))
     return pids
 
 

@@ -1,9 +1,9 @@
-"""A pass of a run submits units and acts on their outcomes, whatever the executor does."""
+"""One pass of a run: how units are settled, and what is counted, doubted and measured."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
@@ -12,11 +12,15 @@ from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, Stor
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
-from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.planning.units import PENDING, StageState, Unit
+from pano_mvs.engine.running import run as run_module
 from pano_mvs.engine.running.dispatcher import FinishedJob
-from pano_mvs.engine.running.events import Observer, RunEvent, RunResult, UnitFinished, UnitStarted
+from pano_mvs.engine.running.events import Failure, Observer, RunEvent, RunResult, UnitFinished, UnitStarted
+from pano_mvs.engine.running.events import ignore as ignore_event
 from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
-from tests.engine.conftest import Toy, ran
+from pano_mvs.engine.running.statistics import PackedFigures, RunStatistics
+from pano_mvs.scene import Axis
+from tests.engine.conftest import Toy, ran, settle
 
 
 class Shelf(SerialExecutor):
@@ -316,3 +320,182 @@ def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
     monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
     RunPass(run, []).drain()
     assert run.computed == {"a", "c", "z"}
+
+
+GUESSES = '''
+
+@dataclass(frozen=True, eq=False)
+class Guess(Record):
+    """A collection that doubts some of its items."""
+    doubts: dict[str, str]
+
+    def doubted(self):
+        return self.doubts
+
+
+class GuessParams(Params):
+    doubts: dict[str, str] = {}
+
+
+@stage("toy.guess")
+def guess(xs: All[Number], params: GuessParams) -> Guess:
+    """Doubt what the settings say."""
+    return Guess(params.doubts)
+
+
+@stage("toy.guess_again")
+def guess_again(guess: One[Guess], params: GuessParams) -> Guess:
+    """Doubt what the settings say."""
+    return Guess(params.doubts)
+
+
+@stage("toy.count_doubts")
+def count_doubts(guess: One[Guess], ctx: Context) -> Files:
+    """Write the number of doubts."""
+    path = ctx.scratch / "count.txt"
+    path.write_text(str(len(guess.doubts)))
+    return Files({"count.txt": path})
+'''
+
+WORKFLOW = """\
+pano_mvs: 1
+name: guesses
+plugins: [plug.py]
+stages:
+  images: {use: toy.source, path: capture}
+  first:  {use: toy.guess}
+  second: {use: toy.guess_again}
+  count:  {use: toy.count_doubts}
+"""
+
+
+@pytest.fixture
+def guesses(toy: Toy) -> Toy:
+    for name, text in (("plug.py", (toy.folder / "plug.py").read_text() + GUESSES), ("wf.yaml", WORKFLOW)):
+        (toy.folder / name).write_text(text)
+        settle(toy.folder / name)
+    return toy
+
+
+def test_a_doubt_ends_with_code_3_and_a_cached_run_says_it_again(guesses: Toy) -> None:
+    doubt = "second.doubts={2.txt: odd}"
+    for computed in (8, 0):
+        result = guesses.run(doubt)
+        assert (result.computed, result.exit_code, result.stopped) == (computed, 3, "")
+        assert result.doubts == {"2.txt": ("second", "odd")}
+        assert not result.failures
+
+
+def test_the_last_value_of_a_kind_decides(guesses: Toy) -> None:
+    first = "first.doubts={2.txt: odd, 3.txt: dark}"
+    passed_on = guesses.run(first, "second.doubts={2.txt: odd}")
+    assert passed_on.doubts == {"2.txt": ("second", "odd")}
+    cleared = guesses.run(first)
+    assert (cleared.exit_code, cleared.doubts) == (0, {})
+
+
+def test_a_doubt_of_a_value_that_nothing_replaces_counts_whatever_else_reads_it(guesses: Toy) -> None:
+    (guesses.folder / "wf.yaml").write_text(WORKFLOW.replace("  second: {use: toy.guess_again}\n", ""))
+    result = guesses.run("first.doubts={2.txt: odd}")
+    assert (result.exit_code, result.doubts) == (3, {"2.txt": ("first", "odd")})
+
+
+def test_files_of_an_earlier_run_go_though_something_is_doubtful(guesses: Toy) -> None:
+    earlier = dict(guesses.run("count.to=here").published)
+    result = guesses.run("count.to=there", "second.doubts={2.txt: odd}", earlier=earlier)
+    assert (result.exit_code, result.removed) == (3, ["here/count.txt"])
+
+
+def test_a_stage_takes_the_time_in_which_its_units_are_computed(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage whose first unit came early and whose last one came late took hours, most of which it waited."""
+    now = [0.0]
+    monkeypatch.setattr("pano_mvs.engine.running.statistics.time.perf_counter", lambda: now[0])
+    entry = toy.session().workflow.stages["scaled"]
+    state = StageState(Axis.IMAGE, pending=set("abcd"))
+
+    def ignore(_names: Iterable[str]) -> None:
+        pass
+
+    result = RunResult()
+    counts = RunStatistics(result, ignore_event, states=lambda _name: state, name_items=ignore)
+    counts.stage_opened(entry)
+
+    def at(time_s: float) -> None:
+        now[0] = time_s
+
+    record = UnitRecord("k", {}, PENDING, seconds=3.0)
+    at(100.0)
+    counts.unit_started(entry, "a")
+    at(101.0)
+    counts.unit_started(entry, "b")
+    at(103.0)
+    counts.unit_done(entry, "a", record, status="run")
+    counts.unit_done(entry, "c", record, status="cached")
+    at(104.0)
+    counts.unit_done(entry, "b", record, status="run")
+    at(200.0)
+    counts.unit_started(entry, "d")
+    at(202.0)
+    counts.unit_failed(Failure("scaled", "d", "why"), 2.0)
+    at(500.0)
+    counts.stage_complete(entry)
+    (summary,) = result.stages
+    assert summary.seconds == 4.0 + 2.0
+    assert (summary.unit_seconds, summary.slowest_s, summary.run) == (6.0, 3.0, 2)
+
+
+class Patient(SerialExecutor):
+    """Reports that nothing has ended yet, each time before it computes a unit."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store, threads=1)
+        self.waits: list[float | None] = []
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        if timeout_s == 0:
+            return None
+        self.waits.append(timeout_s)
+        return super().wait(timeout_s) if len(self.waits) % 2 == 0 else None
+
+
+class Waiting:
+    """Counts how often it learns that a run waits."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, event: RunEvent | None) -> None:
+        self.count += event is None
+
+
+def test_an_observer_learns_that_a_run_waits_and_the_run_goes_on(toy: Toy) -> None:
+    session, observer = toy.session(), Waiting()
+    store = Store(session.store_root)
+    executor = Patient(store)
+    run = Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=executor)
+    assert run.execute().exit_code == 0
+    assert observer.count == len(executor.waits) / 2 > 20
+    assert set(executor.waits) == {run_module.WAIT_S}
+
+
+FIGURES = {"inliers": 213.0, "residual_deg": 0.1 + 0.2, "least": -0.0, "large": 1e300}
+
+
+@pytest.mark.parametrize("names", [[], ["large"], list(FIGURES), list(reversed(FIGURES))])
+def test_packed_figures_equal_a_dict_of_the_same(names: list[str]) -> None:
+    figures = {name: FIGURES[name] for name in names}
+    packed = PackedFigures(figures)
+    assert list(packed.items()) == list(figures.items())
+    assert packed == figures
+    assert packed == PackedFigures(figures)
+    assert len(packed) == len(figures)
+    assert repr(packed) == repr(figures)
+
+
+def test_packed_figures_differ_in_any_name_and_figure() -> None:
+    packed = PackedFigures(FIGURES)
+    assert packed != PackedFigures(FIGURES | {"inliers": 214.0})
+    assert packed != PackedFigures({name: FIGURES[name] for name in ("inliers", "large")})
+    assert "outliers" not in packed
+    with pytest.raises(KeyError, match="outliers"):
+        packed["outliers"]

@@ -63,12 +63,9 @@ def camera_evidence(
     return rows
 
 
-_CERTAIN_LOG10 = -50.0
-
-
 def _has_certain_pair(model: PlacedModel, image: int) -> bool:
     return any(
-        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < _CERTAIN_LOG10
+        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < -50
         for edge, view in (model.pairs.compared or {}).items()
     )
 

@@ -1,26 +1,33 @@
-"""Convert units of work to JSON and back, for workers that share only the cache with the main process.
+"""Units as requests to workers, which share only the cache with the main process: written as JSON, read and served.
 
 A stage that combines all pairs may have half a million inputs. Such large inputs are written into a file in the cache,
-some in each line, so that neither process holds all of them as text.
+some in each line, so that neither process holds all of them as text. Workers keep loaded stages and opened caches
+between units.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.errors import PanoMvsError, PluginError, StoreError, UsageError
 from pano_mvs.core.files import make_folder
-from pano_mvs.core.paths import reason_of
+from pano_mvs.core.paths import is_inside, reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors.protocol import Job
+from pano_mvs.engine.executors.execute import unit_outcome
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
-from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.params import Params, json_settings
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, SourceItem, StageSpec
-from pano_mvs.engine.stages.stage_code import stage_code
+from pano_mvs.engine.stages.stage_code import code_digest, stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -87,7 +94,11 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
     spec = unit.entry.spec
     large = _large_ports(unit) if inputs_file is not None else ()
     inputs = {port: value for port, value in unit.inputs.items() if port not in large}
-    identity = dict(unit.identity)
+    identity, source = dict(unit.identity), None
+    if unit.source is not None:
+        files = {role: str(path.absolute()) for role, path in unit.source.files.items()}
+        digests = dict(unit.source.digests)
+        source = {"name": unit.source.name, "files": files, "links": unit.source.links, "digests": digests}
     if large:
         identity["inputs"] = {name: [] if name in large else part for name, part in identity["inputs"].items()}
     return {
@@ -96,14 +107,14 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
         "use": spec.name,
         "version": spec.version,
         "code": spec.code_digest,
-        "params": _plain(unit.entry.params),
+        "params": json_settings(unit.entry.params, Path.absolute),
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in inputs.items()}
         | {port: {"many": {}} for port in large},
         "inputs_file": str(inputs_file.absolute()) if large and inputs_file else "",
         "external": _external_files(_refs(inputs), store),
-        "source": None if unit.source is None else _source_to_json(unit.source),
+        "source": source,
         "key": unit.key,
         "identity": identity,
     }
@@ -126,6 +137,10 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     inputs = {port: _input_from_json(value) for port, value in text["inputs"].items()}
     if text["inputs_file"]:
         _read_large_inputs(Path(text["inputs_file"]), inputs, text["identity"], store=store)
+    source = text["source"]
+    if source is not None:
+        files = {role: Path(path) for role, path in source["files"].items()}
+        source = SourceItem(source["name"], files, links=tuple(source["links"]), digests=source["digests"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
@@ -133,7 +148,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
         inputs=inputs,
         key=text["key"],
         identity=text["identity"],
-        source=None if text["source"] is None else _source_from_json(text["source"]),
+        source=source,
     )
 
 
@@ -174,24 +189,6 @@ def _changed(spec: StageSpec) -> str:
         f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed during the "
         "run, or another version is installed there. Run the same command again"
     )
-
-
-def _plain(params: Params) -> dict[str, Any]:
-    plain = _with_absolute_paths(params.model_dump(mode="python"), params.model_dump(mode="json"))
-    assert isinstance(plain, dict)
-    return plain
-
-
-def _with_absolute_paths(value: Any, as_json: Any) -> Any:
-    """Return the JSON form of a value with all paths made absolute."""
-    if isinstance(value, Path):
-        return str(value.absolute())
-    if isinstance(as_json, dict) and isinstance(value, dict):
-        pairs = zip(value.values(), as_json.items(), strict=True)
-        return {name: _with_absolute_paths(inner, inner_json) for inner, (name, inner_json) in pairs}
-    if isinstance(as_json, list) and isinstance(value, list | tuple):
-        return [_with_absolute_paths(*pair) for pair in zip(value, as_json, strict=True)]
-    return as_json
 
 
 def _large_ports(unit: Unit) -> tuple[str, ...]:
@@ -235,11 +232,72 @@ def _input_from_json(value: Any) -> UnitInput:
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
 
 
-def _source_to_json(item: SourceItem) -> dict[str, Any]:
-    files = {role: str(path.absolute()) for role, path in item.files.items()}
-    return {"name": item.name, "files": files, "links": item.links, "digests": dict(item.digests)}
+def run_request(request: Mapping[str, Any]) -> JobOutcome:
+    """Compute the unit of a request; see `request_to_json`."""
+    try:
+        store = _store(*request["store"])
+        given, texts = request["plugins"], request.get("plugin_texts", {})
+        # Files sent with the request are written to a temporary folder.
+        files = {path: _written(digest, *texts[path]) if path in texts else path for path, digest in given.items()}
+        plugins = {files[path]: digest for path, digest in given.items()}
+        unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
+    except PanoMvsError as error:
+        return JobOutcome("stopped", cause=str(error), error="UsageError")
+    outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
+    for path, here in files.items():  # name the original file rather than the copy here
+        if here != path:
+            outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
+    return outcome
 
 
-def _source_from_json(value: Mapping[str, Any]) -> SourceItem:
-    files = {role: Path(path) for role, path in value["files"].items()}
-    return SourceItem(value["name"], files, links=tuple(value["links"]), digests=value["digests"])
+_folders: dict[str, TemporaryDirectory[str]] = {}
+
+
+def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
+    if digest not in _folders:
+        folder = _folders[digest] = TemporaryDirectory(prefix="pano-mvs-plugin-")
+        for relative, text in texts.items():
+            path = Path(folder.name) / relative
+            if not is_inside(path, Path(folder.name)):
+                raise UsageError(
+                    f"plugin {name} imports {relative}, which is not beside it, so that it cannot be sent to workers"
+                )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return str(Path(_folders[digest].name) / name)
+
+
+@cache
+def _store(root: str, durable: bool, min_free_bytes: int) -> Store:
+    return Store(Path(root), durable=durable, min_free_bytes=min_free_bytes)
+
+
+@cache
+def _installed() -> Registry:
+    return Registry.installed()
+
+
+@cache
+def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
+    """Load plugin files with the given digests of their code."""
+    registry = Registry()
+    for path, digest in plugins:
+        registry.add_file(Path(path))
+        if code_digest(Path(path)) != digest:
+            raise UsageError(
+                f"plugin {path} is not the same in the worker: it was changed during the run. Run "
+                "the same command again"
+            )
+    return registry
+
+
+def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
+    """Return a stage by name, from the plugin files or the installed ones, after loading what it may use."""
+    spec = _of_files(tuple(plugins.items())).stages.get(name)
+    if spec is None:
+        # Before the first unit, because numba reads its maximum number of threads when it is loaded.
+        importlib.import_module("numba")
+        spec = _installed().stages.get(name)
+    if spec is None:
+        raise PluginError(f"the worker knows no stage {name!r}; {_installed().suggest(name)}")
+    return spec

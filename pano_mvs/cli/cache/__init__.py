@@ -1,1 +1,0 @@
-"""`pano-mvs cache`: inspect, verify and clean a cache."""
