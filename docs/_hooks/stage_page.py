@@ -15,8 +15,8 @@ from pano_mvs import api, stages
 from pano_mvs.engine.stages.params import NOT_IN_KEY
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Port, StageSpec
+from pano_mvs.engine.workflows.editor_schema import workflow_schema
 from pano_mvs.engine.workflows.policy import Policy
-from pano_mvs.engine.workflows.schema import workflow_schema
 
 KINDS = {
     "source": "list the images of a capture and read them",

@@ -24,7 +24,7 @@ from pano_mvs.cli.calibrate_command import calibrate
 from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.evaluate.app import evaluate_app
 from pano_mvs.cli.options import (
     AcceptOption,

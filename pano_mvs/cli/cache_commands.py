@@ -16,7 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.options import CacheOption
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.memory import size_text

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_given
 

@@ -25,10 +25,10 @@ from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit, UnitInput
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.workflows.extends import read_text
+from pano_mvs.engine.workflows.editor_schema import workflow_schema
 from pano_mvs.engine.workflows.resolved import resolved_yaml
-from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
+from pano_mvs.engine.workflows.workflow_file import read_text
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 from pano_mvs.session.planning import RunPlan, plan_session
 from pano_mvs.session.running import Execution

@@ -18,7 +18,7 @@ from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
 from pano_mvs.engine.executors.choose import shape
 from pano_mvs.engine.planning.forecast import Experience, StageForecast, forecast, makespan
 from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
-from pano_mvs.engine.planning.resolve import SourceListing
+from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.planning.units import WHOLE, Unit
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.stage import is_only_planned

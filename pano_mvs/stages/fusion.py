@@ -12,7 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
-from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.points.tracking import sample_surface, track_points
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
-from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView
 from pano_mvs.algorithms.structure.mirrors import find_mirrors, pane_ranges, with_mirrors
 from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray

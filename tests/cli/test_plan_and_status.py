@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.planning.resolve import _static_identity
+from pano_mvs.engine.planning.unit_keys import _static_identity
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.session.session import Session, open_session, presets_folder
 from tests.cli.conftest import Command

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.core import memory
 from pano_mvs.core.errors import RunStoppedError
 from pano_mvs.core.memory import free_memory_bytes, require_address_space, total_memory_bytes

@@ -33,7 +33,7 @@ RAISING = {
 # `Resolver.resolve` resolves a stage, `blobs.exists` takes a reference, the entries of os.scandir know what they are;
 # what a plugin's code is, is asked where any error is the plugin's.
 NOT_OF_PATHS = {
-    ("engine/planning/resolve.py", "resolve"),
+    ("engine/planning/unit_keys.py", "resolve"),
     ("engine/cache/maintenance.py", "is_file"),
     ("engine/cache/maintenance.py", "is_dir"),
 }

@@ -18,8 +18,8 @@ import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.core.yaml_text import MAX_DEPTH, MAX_VALUES
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.workflows.extends import MAX_BYTES, MAX_FILES, MAX_STAGES
 from pano_mvs.engine.workflows.policy import Policy
+from pano_mvs.engine.workflows.workflow_file import MAX_BYTES, MAX_FILES, MAX_STAGES
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.scene import Poses
 

@@ -40,13 +40,13 @@ GROUPS = {
     "keys": Group(
         (
             "pano_mvs/core/digest.py",
-            "pano_mvs/engine/planning/resolve.py",
+            "pano_mvs/engine/planning/unit_keys.py",
             "pano_mvs/engine/planning/units.py",
             "pano_mvs/engine/stages/stage_code.py",
         ),
         (
             "tests/core/test_digests.py",
-            *_engine("stages/stage_code", "planning/resolve", "running/run"),
+            *_engine("stages/stage_code", "planning/unit_keys", "running/run"),
         ),
     ),
     "store": Group(

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces
 from pano_mvs.algorithms.fusion.view import (
     ConfidentView,
-    FusionSettings,
     FusionView,
     ViewWindow,
     held_rays,

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.options import CacheOption, OutOption
 from pano_mvs.core.text import plural
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from pano_mvs.cli.console import Console, print_json
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.options import takes_record
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.endings import guarded
 from pano_mvs.core.errors import UsageError, WorkflowError
 
 if TYPE_CHECKING:  # a command loads what it needs itself

@@ -29,7 +29,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor, with_waiting
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.executors.threads import WORKER_BYTES, share_cores
-from pano_mvs.engine.workflows.extends import read_text
+from pano_mvs.engine.workflows.workflow_file import read_text
 
 SYSTEMS = {"slurm": "sbatch", "pbs": "qsub", "lsf": "bsub", "sge": "qsub"}
 """Queueing system to its command that submits a job."""

@@ -10,7 +10,7 @@ from typing import Any
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.planning.resolve import SourceListing, resolve
+from pano_mvs.engine.planning.unit_keys import SourceListing, resolve
 from pano_mvs.engine.planning.units import OF_CODE, StageState, Unit
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.planning.resolve import Resolver, SourceListing, resolve_source
+from pano_mvs.engine.planning.unit_keys import Resolver, SourceListing, resolve_source
 from pano_mvs.engine.planning.units import WHOLE, StageState, Unit
 from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality
 from pano_mvs.engine.workflows.wiring import Edge, Graph

@@ -13,14 +13,12 @@ from pathlib import Path
 from pano_mvs.core.files import temporary_prefix
 from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import is_inside, stat_of
-from pano_mvs.engine.cache.blobs import DamagedBlobError
-from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
-from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.unit_requests import has_large_inputs
-from pano_mvs.engine.planning.units import PENDING, Unit
-from pano_mvs.scene import Record
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.running.unit_memory import UnitMemory
 
 LOG_FOLDER = "logs"
 _INVALID_CHARACTERS = re.compile(r'[<>:"\\|?*\x00-\x1f]')
@@ -61,8 +59,7 @@ class Dispatcher:
         self._running: dict[int, _RunningJob] = {}
         self._next_number = 0
         self._free_bytes = 0
-        self._loading_bytes: dict[str, int] = {}  # digest of an input to the memory that reading it takes
-        self._latest = ("", 0)  # key and memory of the unit that was asked for last
+        self._memory = UnitMemory(store)
 
     def __len__(self) -> int:
         return len(self._running)
@@ -74,7 +71,7 @@ class Dispatcher:
 
     def fits(self, unit: Unit) -> bool:
         """Return whether the memory that a unit declares is free beside that of the running ones."""
-        needed = self._memory_of(unit)
+        needed = self._memory.of(unit)
         if not needed:
             return True
         used = sum(running.job.memory_bytes for running in self._running.values())
@@ -84,7 +81,7 @@ class Dispatcher:
 
     def refusal(self, unit: Unit) -> str:
         """Return the message for a unit that does not fit although no other one is running."""
-        needed, free = size_text(self._memory_of(unit)), size_text(self._free_bytes)
+        needed, free = size_text(self._memory.of(unit)), size_text(self._free_bytes)
         return (
             f"it declares {needed} of memory, and {free} are free. Close other programs, use smaller images or "
             f"settings, or state with `memory:` in stage {unit.entry.name!r} how much it really needs"
@@ -99,7 +96,7 @@ class Dispatcher:
         threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
         fresh = self._isolate and not unit.entry.spec.is_built_in
-        memory, timeout_s = self._memory_of(unit), unit.entry.policy.timeout_s
+        memory, timeout_s = self._memory.of(unit), unit.entry.policy.timeout_s
         job = Job(self._next_number, unit, threads, timeout_s, log, self._plugins, fresh, memory)
         self._next_number += 1
         self._running[job.number] = _RunningJob(job)
@@ -138,34 +135,6 @@ class Dispatcher:
             _remove_inputs_file(running.job)
         self._running.clear()
 
-    def _memory_of(self, unit: Unit) -> int:
-        """Return the bytes that a unit needs; 0 if neither the workflow, the stage nor the inputs state it."""
-        if self._latest[0] != unit.key:
-            loading = 0 if unit.entry.policy.memory_bytes else self._loading_of(unit)
-            # Every worker has as much as this for reading inputs.
-            counted = loading if loading >= 300_000_000 else 0
-            self._latest = unit.key, memory_of(unit, self._store) + counted
-        return self._latest[1]
-
-    def _loading_of(self, unit: Unit) -> int:
-        """Return the temporary memory for reading the largest of a unit's inputs."""
-        found: list[tuple[ItemRef, type[Record]]] = []
-        for port in unit.entry.spec.ports:
-            value = unit.inputs.get(port.name)
-            if value is None or port.kind.loading_bytes is Record.loading_bytes:
-                continue
-            refs = [value] if isinstance(value, ItemRef) else value.values()
-            found.extend((ref, port.kind) for ref in refs if ref is not PENDING)
-        return max((self._loading_of_item(ref, kind) for ref, kind in found), default=0)
-
-    def _loading_of_item(self, ref: ItemRef, kind: type[Record]) -> int:
-        if ref.digest not in self._loading_bytes:
-            try:
-                self._loading_bytes[ref.digest] = self._store.load(ref, kind).loading_bytes()
-            except DamagedBlobError:
-                return 0  # the unit meets the damage too, and is computed again with its inputs
-        return self._loading_bytes[ref.digest]
-
     def _keep_log(self, job: Job) -> tuple[Path | None, tuple[str, ...]]:
         """Move a unit's log into the output folder, where it replaces that of an earlier run."""
         unit = job.unit
@@ -192,18 +161,6 @@ def _remove_inputs_file(job: Job) -> None:
     if has_large_inputs(job.unit):
         with suppress(OSError):
             job.inputs_file.unlink(missing_ok=True)
-
-
-def memory_of(unit: Unit, store: Store) -> int:
-    """Return the bytes that the workflow, or else the stage, declares for a unit; 0 if neither does."""
-    spec, stated = unit.entry.spec, unit.entry.policy.memory_bytes
-    if stated or spec.memory_needed is None:
-        return stated or spec.memory_bytes
-    try:
-        inputs = {"item": unit.source} if unit.source is not None else arguments_of(unit, store)
-        return spec.memory_needed(unit.entry.params, inputs)
-    except DamagedBlobError:
-        return 0  # the unit meets the damage too, and is computed again with its inputs
 
 
 def log_name(stage: str, item: str) -> str:

@@ -32,7 +32,7 @@ from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.planning.forecast import settings_digest
 from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.planning.ready_queue import ReadyQueue
-from pano_mvs.engine.planning.resolve import SourceListing
+from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, Warned, consequence_of, ignore

@@ -29,7 +29,7 @@ from pano_mvs.engine.stages.stage import StageSpec
 _OURS = Path(pano_mvs.__file__).resolve().parent
 _LEFT_OUT = (
     *(f"pano_mvs/{name}/" for name in ("cli", "report", "viewer")),  # show results, but make none
-    "pano_mvs/engine/",  # counts by planning.resolve.KEY_SCHEMA, which is raised by hand
+    "pano_mvs/engine/",  # counts by planning.unit_keys.KEY_SCHEMA, which is raised by hand
     "pano_mvs/core/kernel_cache.py",  # affects only speed
     "pano_mvs/__init__.py",  # these only collect names
     "pano_mvs/stages/__init__.py",

@@ -11,9 +11,9 @@ from ruamel.yaml.representer import RoundTripRepresenter
 
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.stages.params import json_settings
-from pano_mvs.engine.workflows.extends import FORMAT_VERSION
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
+from pano_mvs.engine.workflows.workflow_file import FORMAT_VERSION
 
 _FIRST_KEYS = ("use", "in")
 

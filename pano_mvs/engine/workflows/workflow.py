@@ -18,8 +18,8 @@ from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest
-from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, merge_stages, read_text
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
+from pano_mvs.engine.workflows.workflow_file import ExtendsReader, WorkflowFile, merge_stages, read_text
 
 
 @dataclass(frozen=True, slots=True)

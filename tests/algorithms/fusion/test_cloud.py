@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from pano_mvs.algorithms.fusion import fuse
 from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
+from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces, surface_heights
-from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView, nearest_views, normals_from_range
+from pano_mvs.algorithms.fusion.view import FusionView, nearest_views, normals_from_range
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec, sines_of_grid

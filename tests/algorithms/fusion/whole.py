@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pano_mvs.algorithms.fusion.fuse import VoxelGrid, _points_of, _tie, fuse_stream
-from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView, ViewWindow, confident_view
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView, ViewWindow, confident_view
 from pano_mvs.scene import PointCloud
 
 

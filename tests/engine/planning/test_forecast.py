@@ -23,7 +23,7 @@ from pano_mvs.engine.planning.forecast import (
     settings_digest,
 )
 from pano_mvs.engine.planning.plan import make_plan
-from pano_mvs.engine.planning.resolve import SourceListing
+from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.scene.image_file import write_png
 from tests.engine.conftest import Toy

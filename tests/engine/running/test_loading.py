@@ -9,10 +9,9 @@ import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.execute import LazyMapping, max_kept_items
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.dispatcher import Dispatcher
+from pano_mvs.engine.running.unit_memory import UnitMemory
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import SourceItem, spec_of
 from pano_mvs.engine.workflows.policy import Policy
@@ -103,14 +102,14 @@ def test_how_many_are_kept_depends_on_open_files_and_on_memory() -> None:
 GIB = 1 << 30
 
 
-def unit_of(function: Any, params: Any, tmp_path: Path, *, memory: str = "0", **more: Any) -> tuple[Dispatcher, Unit]:
+def unit_of(function: Any, params: Any, tmp_path: Path, *, memory: str = "0", **more: Any) -> tuple[UnitMemory, Unit]:
     spec = spec_of(function)
     assert spec is not None
     store = Store(tmp_path / "cache")
     entry = StageEntry("a", spec, params, Policy(use=spec.name, memory=memory), "w:1:1")
     inputs = {name: store.put_value(value) for name, value in more.pop("values", {}).items()}
     unit = Unit(entry, "x", ("x",), inputs, "0" * 32, {}, more.get("source"))
-    return Dispatcher(SerialExecutor(store), store, out=tmp_path / "out", plugins={}), unit
+    return UnitMemory(store), unit
 
 
 def stated(path: Path, width: int, height: int) -> Path:
@@ -124,8 +123,8 @@ def stated(path: Path, width: int, height: int) -> Path:
 def test_a_source_knows_the_decoded_size_by_the_header(tmp_path: Path, width: int, least: float, most: float) -> None:
     """A PNG of 30,000×15,000 took 2.8 GB without a word; what is beyond the limit is refused by name anyway."""
     item = SourceItem("x.png", {"image": stated(tmp_path / "x.png", width, width // 2)})
-    dispatcher, unit = unit_of(folder, FolderParams(path=tmp_path), tmp_path, source=item)
-    assert least * GIB <= dispatcher._memory_of(unit) <= most * GIB
+    memory, unit = unit_of(folder, FolderParams(path=tmp_path), tmp_path, source=item)
+    assert least * GIB <= memory.of(unit) <= most * GIB
 
 
 def panorama(tmp_path: Path, width: int, name: str) -> Panorama:
@@ -140,11 +139,11 @@ def panorama(tmp_path: Path, width: int, name: str) -> Panorama:
 def test_stages_count_what_decoding_their_inputs_takes(
     tmp_path: Path, width: int, name: str, least: float, most: float
 ) -> None:
-    dispatcher, unit = unit_of(sift_tangent, SiftParams(), tmp_path, values={"image": panorama(tmp_path, width, name)})
-    assert least * GIB <= dispatcher._memory_of(unit) <= most * GIB
+    memory, unit = unit_of(sift_tangent, SiftParams(), tmp_path, values={"image": panorama(tmp_path, width, name)})
+    assert least * GIB <= memory.of(unit) <= most * GIB
 
 
 def test_what_the_workflow_says_goes_first(tmp_path: Path) -> None:
     values = {"image": panorama(tmp_path, 30_000, "x.jpg")}
-    dispatcher, unit = unit_of(sift_tangent, SiftParams(), tmp_path, memory="1GB", values=values)
-    assert dispatcher._memory_of(unit) == 10**9
+    memory, unit = unit_of(sift_tangent, SiftParams(), tmp_path, memory="1GB", values=values)
+    assert memory.of(unit) == 10**9

@@ -18,9 +18,9 @@ from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.file_names import folder_problem, is_plain_name, item_problem
 from pano_mvs.core.yaml_text import MAX_PROBLEMS, parse_yaml
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.workflows.extends import MAX_BYTES, read_text
 from pano_mvs.engine.workflows.wiring import wire
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow, load_workflow
+from pano_mvs.engine.workflows.workflow_file import MAX_BYTES, read_text
 from pano_mvs.session.session import presets_folder
 from tests.engine.conftest import Toy
 

@@ -1,4 +1,4 @@
-"""Read a workflow file and the files that it extends, and merge their stages."""
+"""Read a workflow file with its top-level keys, and the files that it extends; merge their stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Print exceptions as error messages and end with their exit codes, which `core/errors.py` defines for each class."""
+"""End commands: print errors, or how to go on, and exit with the code that `core/errors.py` defines for each class."""
 
 from __future__ import annotations
 

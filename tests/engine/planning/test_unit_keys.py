@@ -12,7 +12,7 @@ import pytest
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.planning.resolve import KEY_SCHEMA, resolve, resolve_source
+from pano_mvs.engine.planning.unit_keys import KEY_SCHEMA, resolve, resolve_source
 from pano_mvs.engine.planning.units import PENDING, WHOLE, StageState, Unit
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.stages.stage_code import stage_code

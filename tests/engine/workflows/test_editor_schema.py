@@ -11,8 +11,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.editor_schema import workflow_schema
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
-from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader
 from pano_mvs.session.session import presets_folder
 from tests.engine.toy import HELPER, PLUGIN

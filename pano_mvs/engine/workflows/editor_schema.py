@@ -9,8 +9,8 @@ from urllib.parse import quote
 from pano_mvs.core.yaml_text import Located
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
-from pano_mvs.engine.workflows.extends import FORMAT_VERSION
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
+from pano_mvs.engine.workflows.workflow_file import FORMAT_VERSION
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _LIST = [{"type": "array", "items": {"type": "string"}}, {"type": "null"}]

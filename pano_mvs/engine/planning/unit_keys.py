@@ -1,4 +1,4 @@
-"""Find the units of work of a stage from the results of the stages that feed it, and make their cache keys."""
+"""Make the cache keys of units from code, settings and inputs, and find the units of a stage from what feeds it."""
 
 from __future__ import annotations
 
