@@ -129,6 +129,12 @@ def test_a_damaged_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         person_in_middle(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
 
 
+def test_a_network_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(person_views, "_POSE", ("nothing.onnx", person_views._POSE[1]))
+    with pytest.raises(UsageError, match=r"nothing\.onnx: this network is missing\. Install pano-mvs again"):
+        person_in_middle(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+
+
 def with_somebody(pose: str, *, reach: float) -> Drawn:
     camera = Rigid3.from_center(np.eye(3), np.zeros(3))
     picture, ranges = render(default_room(0, "weak"), camera, (256, 512), supersample=1)

@@ -1,7 +1,7 @@
-"""The neural networks ALIKED and LightGlue as ONNX files, and their execution by ONNX Runtime.
+"""Execution of neural networks by ONNX Runtime, and the ONNX files of ALIKED and LightGlue.
 
-The files come with the package; `tools/export_networks.py` writes them. Another folder may hold files of the same names
-with the same inputs and outputs, for example with weights of one's own, or the two files that COLMAP downloads.
+These files come with the package; `tools/export_networks.py` writes them. Another folder may hold files of the same
+names with the same inputs and outputs, for example with weights of one's own, or the two files that COLMAP downloads.
 """
 
 from __future__ import annotations
@@ -127,18 +127,17 @@ class Networks:
                 )
 
     def _path(self, file: str) -> Path:
-        path = (_PACKAGED if self.models is None else self.models) / file
+        if self.models is None:
+            return _checked(_PACKAGED / file, DIGESTS[file])
+        path = self.models / file
         if not is_file(path):
-            remedy = (
-                "Install pano-mvs again"
-                if self.models is None
-                else "tools/export_networks.py writes all files, or take aliked-n16rot.onnx and "
-                "aliked-lightglue.onnx of COLMAP 4"
+            own = [name for name in DIGESTS if is_file(self.models / name)]
+            raise UsageError(
+                f"{path}: this network is missing. tools/export_networks.py writes all files, or take "
+                "aliked-n16rot.onnx and aliked-lightglue.onnx of COLMAP 4"
+                + (f", in a folder without {' and '.join(own)}" if own else "")
             )
-            own = [name for name in DIGESTS if self.models is not None and is_file(self.models / name)]
-            remedy += f", in a folder without {' and '.join(own)}" if own else ""
-            raise UsageError(f"{path}: this network is missing. {remedy}")
-        return path if self.models is not None else _checked(path, DIGESTS[file])
+        return path
 
 
 PACKAGED = Networks()
@@ -205,7 +204,9 @@ class Network:
 
 
 def _checked(path: Path, digest: str) -> Path:
-    if is_file(path) and _digest(path, path.stat().st_mtime_ns) != digest:
+    if not is_file(path):
+        raise UsageError(f"{path}: this network is missing. Install pano-mvs again")
+    if _digest(path, path.stat().st_mtime_ns) != digest:
         raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
     return path
 

@@ -92,9 +92,9 @@ def fill_from_prior(
     Returns:
         The range map and the relative standard deviation of the network's ranges: their deviation from confirmed ranges
         in areas that were left out of the alignment. It is infinite, and the range map is unchanged, where that is
-        not less than the deviation of a constant range. Pixels that other views saw, or that lie on the planes or in
-        the mirrors of depth.structure, keep their ranges. Others get the network's, with confidence 3–63; none where
-        the network's are nearer or farther than all measured ones, where the fit was not tested.
+        not less than the deviation of a constant range. Pixels that other views saw, or that lie on the planes, in
+        the mirrors or in the windows of depth.structure, keep their ranges. Others get the network's, with confidence
+        3–63; none where the network's are nearer or farther than all measured ones, where the fit was not tested.
     """
     require_guide(guide, range_map)
     known = (range_map.confidence >= FILLED_CONFIDENCE[1]) & np.isfinite(prior)

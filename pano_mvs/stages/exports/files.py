@@ -243,7 +243,8 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
 def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
     """Write a preview of each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
 
-    Masked pixels and pixels without a range are grey. Ranges that no other view confirms are pale, filled ones striped.
+    Masked pixels and pixels without a range are grey. Ranges that no other view confirms are pale, filled ones striped,
+    and panes of mirrors and windows chequered.
     """
     path = ctx.scratch / "preview.jpg"
     write_preview(path, image.load(), range_map.range, mask=image.load_mask(), confidence=range_map.confidence)

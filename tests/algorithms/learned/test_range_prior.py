@@ -14,7 +14,7 @@ from pano_mvs.algorithms.learned.range_prior import fill_from_prior, network_val
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE, WINDOW_CONFIDENCE
 from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 
@@ -78,9 +78,10 @@ def test_no_range_is_extrapolated() -> None:
     np.testing.assert_array_equal(found.range, measured().range)
 
 
-def test_mirrors_keep_the_range_of_their_pane() -> None:
+@pytest.mark.parametrize("pane", [MIRROR_CONFIDENCE, WINDOW_CONFIDENCE])
+def test_mirrors_and_windows_keep_the_range_of_their_pane(pane: int) -> None:
     given = measured()
-    given = replace(given, confidence=np.where(HOLE, np.uint8(MIRROR_CONFIDENCE), given.confidence))
+    given = replace(given, confidence=np.where(HOLE, np.uint8(pane), given.confidence))
     found, _ = fill_from_prior(given, GUIDE, TRUTH, output="range")
     np.testing.assert_array_equal(found.range, given.range)
     np.testing.assert_array_equal(found.confidence, given.confidence)

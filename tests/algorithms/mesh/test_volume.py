@@ -22,7 +22,7 @@ from pano_mvs.algorithms.mesh.volume import (
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 from tests.algorithms.mesh.box import HALF, Capture, box, capture, poses
 from tests.oracles.surfaces import mean_distances
 
@@ -168,6 +168,14 @@ def test_a_surface_is_removed_where_more_panoramas_look_through_it_than_measured
     assert area_near_board([shown[0], through[1]]) > 0.7
     assert area_near_board([shown[0], *through[1:3]]) < 0.1
     assert area_near_board([shown[0], *unsure[1:3]]) > 0.7
+
+
+def test_the_pane_of_a_window_remains_although_another_panorama_looks_through_it() -> None:
+    shown = board_seen_from((0, 0, -1.5), (0.2, 0, -1.5))
+    through = replace(shown[1][0], range=np.full_like(shown[1][0].range, 4)), shown[1][1]
+    for confidence, remains in ((WINDOW_CONFIDENCE, True), (WEAK_CONFIDENCE[0], False)):
+        item = replace(shown[0][0], confidence=np.full_like(shown[0][0].confidence, confidence))
+        assert (area_near_board([(item, shown[0][1]), through]) > 0.7) == remains
 
 
 def test_narrow_gaps_close() -> None:
