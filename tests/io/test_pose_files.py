@@ -263,6 +263,7 @@ def matrix(x: float, last: tuple[int, ...] = (0, 0, 0, 1)) -> list[Any]:
         ("nerfstudio", MATRIX, [1], r": frames\[0\]: key 'transform_matrix'"),
         ("nerfstudio", MATRIX, matrix(0, (1, 2, 3, 1)), ": .*transposed"),
         ("nerfstudio", MATRIX, matrix(10**400), ": .*4 × 4 numbers"),
+        ("nerfstudio", MATRIX, matrix(float("nan")), r": frames\[0\] \(1\.jpg\): the pose holds NaN"),
         ("nerfstudio", MATRIX, matrix(1e308), ": .*not a valid pos"),
         ("nerfstudio", (), {"cameras": []}, ": neither key 'frames'"),
         ("nerfstudio", (), [], ": expected a JSON object, got list"),
