@@ -116,7 +116,7 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
     if np.abs(translation).max() > 1e12:
         raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is not a valid position")
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if error > 1e-3:
         raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
     if np.linalg.det(rotation) < 0:
