@@ -140,6 +140,8 @@ def report_invalid(
             problems.add(found.key_place, f"{subject}setting {key!r} is missing")
         else:
             message = problem["msg"].removeprefix("Value error, ")
+            if problem["type"] == "model_type":  # pydantic's message names the class
+                message = "must be a mapping of settings"
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
             setting = f"{key}: " if key else ""
             problems.add(found.place, f"{subject}{setting}{message} (got {shown})")

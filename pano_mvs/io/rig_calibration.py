@@ -32,7 +32,9 @@ Model = Literal["kannala_brandt", "opencv_fisheye"]
 MODELS: tuple[Model, ...] = get_args(Model)
 GUIDE = "docs/rigs.md shows a complete file and where the numbers come from"
 
+_MAX_BYTES = 1 << 20  # of a larger file, YAML takes minutes
 _Number = Annotated[float, Field(strict=True)]
+_Pixels = Annotated[_Number, Field(ge=1, multiple_of=1)]
 _Pair = tuple[_Number, _Number]
 _Triple = tuple[_Number, _Number, _Number]
 _Quadruple = tuple[_Number, _Number, _Number, _Number]
@@ -77,7 +79,7 @@ class _Pose(_Keys):
 class _Lens(_Keys):
     """The numbers of a lens, by the names of docs/rigs.md."""
 
-    image_size_px: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    image_size_px: tuple[_Pixels, _Pixels]
     focal_px: tuple[Annotated[_Number, Field(gt=0)], Annotated[_Number, Field(gt=0)]]
     principal_point_px: _Pair
     distortion: _Quadruple
@@ -89,7 +91,7 @@ class _Lens(_Keys):
     def _is_inside(cls, point: _Pair, known: ValidationInfo) -> _Pair:
         width, height = known.data.get("image_size_px", (np.inf, np.inf))
         if not (0 <= point[0] <= width and 0 <= point[1] <= height):
-            raise ValueError(f"is outside of the picture of {width}×{height} pixels")
+            raise ValueError(f"is outside of the picture of {width:.0f}×{height:.0f} pixels")
         return point
 
     @model_validator(mode="after")
@@ -105,7 +107,7 @@ class _Lens(_Keys):
         width, height = self.image_size_px
         center = self.principal_point_px[0] + shift_px, self.principal_point_px[1] + shift_px
         half = float(np.radians(self.field_of_view_deg / 2))
-        return FisheyeLens((height, width), self.focal_px, center, self.distortion, half)
+        return FisheyeLens((int(height), int(width)), self.focal_px, center, self.distortion, half)
 
 
 class _Calibration(_Keys):
@@ -151,9 +153,11 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_d
 
 
 def _parsed(file: FilePart) -> _Calibration:
-    problems = Problems()
+    problems, data = Problems(), file.read_bytes()
+    if len(data) > _MAX_BYTES:
+        raise InputError(f"{file.path}: too large for a calibration file ({len(data)} bytes). {GUIDE}")
     try:
-        root = parse_yaml(file.read_bytes().decode("utf-8-sig", "replace"), str(file.path))
+        root = parse_yaml(data.decode("utf-8-sig", "replace"), str(file.path))
         try:
             return _Calibration.model_validate(root.plain())
         except ValidationError as error:

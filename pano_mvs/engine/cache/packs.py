@@ -196,6 +196,9 @@ class Packs:
         return [pack for pack in children(self.folder, "*.pack") if pack not in self._indexes]
 
     def _write_index(self, pack: Path, entries: NDArray[Any]) -> None:
+        if not len(entries):  # collection finds packs by their values
+            self.remove(pack)
+            return
         write_checked(pack.with_suffix(".index"), entries.tobytes(), temporary_in=self._temporary, durable=True)
 
     def _refresh(self, *, force: bool) -> None:

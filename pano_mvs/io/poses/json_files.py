@@ -94,7 +94,9 @@ def transforms_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         name = image_name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
         require_panorama(frame.get("camera_model", data.get("camera_model")), "EQUIRECTANGULAR", f"{where} ({name})")
         matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
-        if np.isfinite(matrix).all() and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        if not np.isfinite(matrix).all():
+            raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
+        if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
         # OpenGL's camera frame is x right, y up, z backwards.
         rotation = matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0])
@@ -114,7 +116,7 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
     if np.abs(translation).max() > 1e12:
         raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is not a valid position")
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if error > 1e-3:
         raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
     if np.linalg.det(rotation) < 0:

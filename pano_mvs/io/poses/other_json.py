@@ -42,18 +42,18 @@ def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     poses: dict[str, Rigid3] = {}
     # Views that share a camera class name it once and refer to it by number afterwards.
     kinds = {
-        one.get("polymorphic_id"): one["polymorphic_name"] for one in cameras.values() if "polymorphic_name" in one
+        str(one.get("polymorphic_id")): one["polymorphic_name"] for one in cameras.values() if "polymorphic_name" in one
     }
     for key, view in _by_key(data, "views", path).items():
         where = f"{path}: view {key}"
         about = _inner(view, where)
-        pose = extrinsics.get(about.get("id_pose"))
+        pose = extrinsics.get(str(about.get("id_pose")))
         if pose is None:
             continue
         name = image_name(about, "filename", where)
-        camera = cameras.get(about.get("id_intrinsic"), {})
+        camera = cameras.get(str(about.get("id_intrinsic")), {})
         number = camera.get("polymorphic_id")
-        kind = camera.get("polymorphic_name", kinds.get(number | _NEW if isinstance(number, int) else -1))
+        kind = camera.get("polymorphic_name", kinds.get(str(number | _NEW) if isinstance(number, int) else ""))
         require_panorama(kind, _SPHERICAL, f"{where} ({name})")
         folder = str(about.get("local_path") or "").replace("\\", "/").strip("/")
         names.append(f"{folder}/{name}" if folder else name)
@@ -62,15 +62,15 @@ def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     return poses
 
 
-def _by_key(data: dict[str, Any], section: str, path: Path) -> dict[Any, dict[str, Any]]:
-    """Return the values of a map that is stored as a list of keys and values."""
+def _by_key(data: dict[str, Any], section: str, path: Path) -> dict[str, dict[str, Any]]:
+    """Return the values of a map that is stored as a list of keys, here as text, and values."""
     entries = data[section]
     if not isinstance(entries, list) or not all(
         isinstance(entry, dict) and isinstance(entry.get("key"), int) and isinstance(entry.get("value"), dict)
         for entry in entries
     ):
         raise InputError(f"{path}: key {section!r} must be a list of keys and values, as openMVG writes it")
-    return {entry["key"]: entry["value"] for entry in entries}
+    return {str(entry["key"]): entry["value"] for entry in entries}
 
 
 def _inner(view: dict[str, Any], where: str) -> dict[str, Any]:
@@ -152,16 +152,16 @@ def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     Raises:
         InputError: if a value is invalid, or a camera is not equirectangular; it names the view or the pose.
     """
-    cameras = {entry.get("intrinsicId"): entry for entry in _entries(data, "intrinsics", path)}
-    placed = {entry.get("poseId"): entry.get("pose") for entry in _entries(data, "poses", path)}
+    cameras = {str(entry.get("intrinsicId")): entry for entry in _entries(data, "intrinsics", path)}
+    placed = {str(entry.get("poseId")): entry.get("pose") for entry in _entries(data, "poses", path)}
     found: list[tuple[str, Rigid3]] = []
     for view in _entries(data, "views", path):
-        if (pose := placed.get(view.get("poseId"))) is None:
+        if (pose := placed.get(str(view.get("poseId")))) is None:
             continue
         where = f"{path}: view {view.get('viewId')}"
         file = image_name(view, "path", where)
         in_rig = str(view.get("rigId", "-1")) not in {"-1", str((1 << 32) - 1)}  # in newer and older files
-        kind = "part of a rig" if in_rig else cameras.get(view.get("intrinsicId"), {}).get("type")
+        kind = "part of a rig" if in_rig else cameras.get(str(view.get("intrinsicId")), {}).get("type")
         require_panorama(kind, "equirectangular", f"{where} ({file})")
         found.append((file, _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
     require_distinct([name for name, _ in found], path)

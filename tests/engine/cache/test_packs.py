@@ -22,6 +22,7 @@ from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache import maintenance
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.maintenance import collect, pack, usage_of, verify
+from pano_mvs.engine.cache.packs import Packed
 from pano_mvs.engine.cache.store import ItemRef, Store
 from tests.engine.conftest import Toy
 
@@ -251,6 +252,21 @@ def test_a_damaged_value_in_a_pack_is_removed_from_its_index_alone(tmp_path: Pat
         Store(tmp_path).blobs.get(refs[2])
     assert [store.blobs.exists(ref) for ref in refs] == [True, True, False, True]
     assert path.read_bytes().count(b'{"a":') == 4
+
+
+def test_a_pack_without_values_is_removed(tmp_path: Path) -> None:
+    """Another process may have packed and removed all values meanwhile; or the only value is damaged."""
+    store = Store(tmp_path)
+    gone = tmp_path / "blobs" / "gone.json"
+    value = Packed(store.blobs.packs.folder, 0, 7, "0" * 32, ".json")
+    store.blobs.packs.add([(value, gone)])
+    assert not files(tmp_path, "*")
+    gone.parent.mkdir(exist_ok=True)
+    gone.write_bytes(b'{"a":1}')
+    store.blobs.packs.add([(value, gone)])
+    assert len(files(tmp_path, "*")) == 2
+    assert len(verify(store).removed) == 1
+    assert not files(tmp_path, "*")
 
 
 PACKER = """

@@ -90,7 +90,9 @@ def test_opencv_counts_pixels_from_the_centre_of_the_first(tmp_path: Path) -> No
         ("first_pixel_px: 0", "first_pixel_px: 1", "2:17: first_pixel_px: must be 0.5 (COLMAP) or 0"),
         ("first_pixel_px: 0\n", "", "1:1: setting 'first_pixel_px' is missing"),
         ("[640, 480]", "[640]", "5:5: setting 'lenses.front.image_size_px.1' is missing"),
-        ("[640, 480]", "[640, 4.5]", "5:26: lenses.front.image_size_px.1: Input should be a valid integer"),
+        ("[640, 480]", "[640, 4.5]", "5:26: lenses.front.image_size_px.1: Input should be a multiple of 1"),
+        ("[640, 480]", "['640', 480]", "5:21: lenses.front.image_size_px.0: Input should be a valid number"),
+        ("[640, 480]", "[true, 480]", "5:21: lenses.front.image_size_px.0: Input should be a valid number"),
         ("[150.0, 151.0]", "[150.0, -1]", "6:23: lenses.front.focal_px.1: Input should be greater than 0"),
         (
             "[319.5, 239.5]",
@@ -118,11 +120,21 @@ def test_errors_state_file_line_key_and_remedy(tmp_path: Path, old: str, new: st
 
 
 @pytest.mark.parametrize(
-    "text", ["", "- 1\n", "3\n", "\x00", "model: kannala_brandt\nfirst_pixel_px: 0\nlenses: {a: 1}\n"]
+    "text",
+    [
+        "",
+        "- 1\n",
+        "3\n",
+        "\x00",
+        "model: kannala_brandt\nfirst_pixel_px: 0\nlenses: {a: 1}\n",
+        f"extra: [{'1, ' * 400_000}1]\n",
+    ],
+    ids=["empty", "a list", "a number", "a control character", "a lens that is a number", "too large"],
 )
 def test_files_that_are_no_calibration_are_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"(?s)rig\.yaml.*docs/rigs\.md"):
+    with pytest.raises(InputError, match=r"(?s)rig\.yaml.*docs/rigs\.md") as error:
         read_rig(file_of(tmp_path, text))
+    assert "instance of" not in str(error.value)
 
 
 def test_a_stitching_distance_inside_of_the_rig_is_refused(tmp_path: Path) -> None:
