@@ -107,9 +107,9 @@ def verify(
     """Check poses of any origin against the images, and correct errors caused by repeated structure.
 
     Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
-    confirm, and the share to be expected. A camera far below the expected share is tried at the other poses that its
-    matches suggest. It is moved if the images confirm another pose clearly better, left out if nothing supports it, or
-    reported as doubtful. Without features and matches the stage only reports.
+    confirm, and the share to be expected. These and the pairs give the probability that the camera is right. A doubtful
+    one is moved if another pose that its matches suggest is more probable, left out if it is surely wrong, or reported.
+    Without features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)
@@ -119,7 +119,7 @@ def verify(
             poses.cam_from_world(poses.names.index(name)).center,
             verified.cam_from_world(verified.names.index(name)).center,
         ):
-            ctx.note(f"{name} was moved to another place, which the images confirm better")
+            ctx.note(f"{name} was moved to another place, which is more probably right")
     return checked_poses(verified, ctx)
 
 

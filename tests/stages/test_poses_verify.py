@@ -56,7 +56,7 @@ def verified(
 @pytest.mark.slow
 def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
     poses = verified(tiny, ctx)
-    assert ctx.notes == [f"{WRONG} was moved to another place, which the images confirm better"]
+    assert ctx.notes == [f"{WRONG} was moved to another place, which is more probably right"]
     assert poses.doubts == {}
     assert poses.points_in_world.shape[0] > 50
     truth = dict(zip(tiny.names, tiny.poses, strict=True))

@@ -38,10 +38,10 @@ class CameraChecks:
 def correct_cameras(
     model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), miss_cost: float = MISS_COST
 ) -> CameraChecks:
-    """Check all cameras of a model by the images, and correct those for which another pose explains more.
+    """Check all cameras of a model by the images, and correct those for which another pose is more probable.
 
-    Cameras that confirm much less than their neighbours are tried at the other poses that their pairs suggest, against
-    cameras that are not suspect. The model is changed in place.
+    Doubtful cameras are tried at the other poses that their pairs suggest, against cameras that are not doubtful. The
+    model is changed in place.
 
     Args:
         model: a model with two or more cameras.
@@ -51,28 +51,27 @@ def correct_cameras(
     """
     found = CameraChecks()
     _judge(model, confirmation, found)
-    ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
-    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest. If no
-    # more than a tenth can be expected to be confirmed, nothing can be concluded.
+    _believe(model, found, miss_cost=miss_cost)
     suspects = sorted(
-        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > 0.1),
-        key=lambda image: (ratios[image], image),
+        (image for image, p in found.p_right.items() if image not in fixed and is_doubtful(p, miss_cost=miss_cost)),
+        key=lambda image: (found.p_right[image], image),
     )
     trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
     if len(trusted) < 2:
         trusted = dict(model.cameras)
     for image in suspects:
-        if image not in fixed and (pose := _better_place(model, image, trusted, confirmation=confirmation)):
+        if pose := _more_probable_place(model, image, trusted, confirmation=confirmation, found=found):
             model.add(image, pose)
             trusted[image] = pose
             found.moved.add(image)
     if found.moved:
+        found.links_contradicting = np.nan
         _judge(model, confirmation, found)
-    while True:
         _believe(model, found, miss_cost=miss_cost)
-        if not _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
-            return found
+    while _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
         _judge(model, confirmation, found)
+        _believe(model, found, miss_cost=miss_cost)
+    return found
 
 
 def check_cameras(model: PlacedModel) -> CameraChecks:
@@ -111,21 +110,23 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
     found.expected = {image: expected_of(image) for image in evidence}
 
 
-def _better_place(
-    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], *, confirmation: Confirmation
+def _more_probable_place(
+    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], *, confirmation: Confirmation, found: CameraChecks
 ) -> Rigid3 | None:
-    """Return another pose of an image that the images confirm clearly better than its own; None if there is none."""
+    """Return the pose of an image at which it is most probably right; None for its own, or if there is no other."""
     cameras = {idx: camera for idx, camera in trusted.items() if idx != image}
     if len(cameras) < 2:
         return None
-    here = confirmation.share(image, model.cameras[image], cameras)
-    # Another pose is used if it is better by this factor and by this difference.
-    best, best_share = None, max(1.15 * here, here + 0.03)
-    for pose in _alternatives(model, image, cameras):
-        share = confirmation.share(image, pose, cameras)
-        if share > best_share:
-            best, best_share = pose, share
-    return best
+
+    def probability(pose: Rigid3) -> float:
+        moved = model.copy()
+        moved.add(image, pose)
+        shares = {**found.shares, image: confirmation.share(image, pose, cameras)}
+        return FITTED.probability(camera_evidence(moved, shares, found.expected, images=[image])[image])
+
+    poses = [model.cameras[image], *_alternatives(model, image, cameras)]
+    best = max(poses, key=probability)
+    return None if best is poses[0] else best
 
 
 def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3]) -> list[Rigid3]:

@@ -34,10 +34,10 @@ def verify_poses(
 ) -> Poses:
     """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
-    Every camera is swept with its neighbours at 256 columns. A camera that confirms much less than its neighbours is
-    tried at the other poses that its pairs suggest; if the images confirm one of them clearly better, it is moved
-    there. All measurements together give the probability that each camera is right (`docs/method.md`); one that is more
-    probably wrong than its cost allows is doubted, or left out if it is as surely wrong as others are right.
+    Every camera is swept with its neighbours at 256 columns. All measurements together give the probability that each
+    camera is right (`docs/method.md`). One that is more probably wrong than its cost allows is moved to the pose that
+    is most probable of all that its pairs suggest. If it still is, it is doubted, or left out if it is as surely wrong
+    as others are right.
 
     Args:
         poses: of any origin. Cameras that are not moved keep their poses exactly.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,16 @@ def camera_evidence(
     shares: Mapping[int, float],
     expected: Mapping[int, float],
     *,
+    images: Collection[int] | None = None,
     contradicting_before: float = np.nan,
 ) -> dict[int, Row]:
-    """Return the evidence for each camera of a model, which is to be measured after all choices were made.
+    """Return the evidence for cameras of a model, which is to be measured after all choices were made.
 
     Args:
         model: the cameras, with their pairs if these are known.
         shares: image position to the share of its texture that other images confirm; NaN where unknown.
         expected: image position to the share that its neighbours suggest.
+        images: whose evidence to return; None for that of all cameras.
         contradicting_before: the largest `links_contradicting` of the model with cameras that were left out since then:
             what contradicted them speaks against those that agree with them, such as copies of a room, as well.
 
@@ -47,7 +49,7 @@ def camera_evidence(
     linked, links_contradicting = _links(model)
     links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
-    for image in sorted(model.cameras):
+    for image in sorted(model.cameras if images is None else images):
         share = shares.get(image, np.nan)
         of_pairs = _of_pairs(model, image)
         # If no pair agrees, and those that do not may be chance, the pairs say nothing.
