@@ -16,6 +16,7 @@ from pano_mvs.algorithms.two_view.minimal_solvers import (
     essential_from_bearings,
     samples_needed,
 )
+from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -25,7 +26,8 @@ from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
 _SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
-_POLISH = 1000  # number of inliers on which the best hypothesis so far is refined
+_LEADERS = 6  # number of hypotheses whose direction is estimated again
+_POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,9 @@ def estimate_two_view(
 
     Minimal hypotheses are ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC"), in which a match
     behind a camera is an outlier, and every new best hypothesis is optimised on its inliers (Chum et al. 2003, "Locally
-    optimized RANSAC"). Finally the angular error is minimised over the five degrees of freedom: of all matches, with a
-    robust loss that narrows, and of the inliers. `verify_pair` decides whether the result is more than chance.
+    optimized RANSAC"). The directions of the leading hypotheses are then estimated again (see `best_redirected`), and
+    finally the angular error is minimised over the five degrees of freedom. `verify_pair` decides whether the result is
+    more than chance.
 
     Args:
         bearings_first: (M, 3) unit rays in the first camera.
@@ -87,10 +90,12 @@ def estimate_two_view(
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     # Stop when a better model would have been found with this probability.
-    pose = search.run(confidence=0.9999, max_iterations=max_iterations)
-    if pose is None:
+    leaders = search.run(confidence=0.9999, max_iterations=max_iterations)
+    if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
+    pose: Rigid3 | None = leaders[0]
     if refine:
+        pose = best_redirected(leaders, first, second, rng=rng, threshold_rad=threshold_rad)
         pose = _refined(pose, first, second, threshold_rad=threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is supported by eight matches")
@@ -102,12 +107,7 @@ def _none(count: int, reason: str) -> RelativePose:
 
 
 def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3 | None:
-    """Minimise the angular error, at last over the matches around the inliers; None if fewer than eight are left."""
-    settled = pose
-    for widen in (2.0, 0.5):
-        settled = refine_relative_pose(settled, first, second, scale_rad=widen * threshold_rad, max_iterations=8)
-    costs = facing_costs([pose, settled], first, second, threshold_rad=threshold_rad)
-    pose = settled if costs[1] < costs[0] else pose
+    """Minimise the angular error over the matches around the inliers; None if fewer than eight are left."""
     for _ in range(3):
         residuals, near = agreement(pose, first, second, threshold_rad=2 * threshold_rad)
         if near.sum() < _MIN_INLIERS:
@@ -120,7 +120,7 @@ def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_r
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The random search for the best hypothesis."""
+    """The random search for the leading hypotheses."""
 
     first: FloatArray
     second: FloatArray
@@ -129,24 +129,29 @@ class _Search:
     solver: MinimalSolver
     optimise: bool
 
-    def run(self, *, confidence: float, max_iterations: int) -> Rigid3 | None:
-        """Return the best pose; None if no sample has one."""
-        best, best_cost = None, np.inf
+    def run(self, *, confidence: float, max_iterations: int) -> list[Rigid3]:
+        """Return the leading poses, best first.
+
+        There is one pose if a better one would have been found by now, and several if the search reached its limit.
+        """
+        leaders: list[tuple[float, int, Rigid3]] = []
         samples, tried, needed = 0, 0, np.inf
         while samples < needed and tried < max_iterations:
-            pose, cost, count = self._best_of_batch(best_cost)
+            worst = leaders[-1][0] if len(leaders) == _LEADERS else np.inf
+            pose, cost, count = self._best_of_batch(worst)
             samples, tried = samples + self.solver.batch, tried + max(count, self.solver.batch)
-            if pose is None or cost >= best_cost:
+            if pose is None:
                 continue
-            if self.optimise:
-                pose, cost = self._optimised(pose, cost)
-            ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
-            needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
-            best, best_cost = pose, cost
-        return best
+            if not leaders or cost < leaders[0][0]:
+                if self.optimise:
+                    pose, cost = self._optimised(pose, cost)
+                ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
+                needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
+            leaders = sorted([*leaders, (cost, tried, pose)], key=lambda item: item[:2])[:_LEADERS]
+        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)]
 
-    def _best_of_batch(self, limit: float) -> tuple[Rigid3 | None, float, int]:
-        """Return the best pose of a batch if it costs less than a limit, its cost, and the number of trials."""
+    def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
+        """Return the best pose of a batch if it costs less than `worst`, its cost, and the number of trials."""
         size = len(self.first)
         drawn = draw_samples(self.rng, size, batch=self.solver.batch, sample=self.solver.sample)
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
@@ -160,7 +165,7 @@ class _Search:
             self.second[screened],
             threshold_rad=self.threshold_rad,
             # The cost without cheirality is a lower bound of the cost.
-            limit=limit if len(self.first) <= _SCREEN else np.inf,
+            limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=3.0 if self.optimise else np.inf,
             count=4,
         )

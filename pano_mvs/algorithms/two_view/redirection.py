@@ -5,9 +5,53 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.algorithms.two_view.cheirality import facing_costs
-from pano_mvs.algorithms.two_view.refinement import cross, refined_on_agreeing
+from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose, refined_on_agreeing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
+
+
+def best_redirected(
+    poses: list[Rigid3], first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> Rigid3:
+    """Return the pose with the lowest truncated squared error that is reached from the given ones.
+
+    If two thirds of the matches are false, eight random matches are rarely all true; but an 8-point solution with some
+    false ones often has nearly the right rotation and a wrong direction. Given the rotation, two matches determine the
+    direction, t ∝ (R p₁ × q₁) × (R p₂ × q₂), and robust refinement finds the rest.
+
+    Args:
+        poses: second_from_first of the leading hypotheses, at least one, |t| = 1.
+        first: (M, 3) unit bearings of all matches, M ≥ 2.
+        second: (M, 3) unit bearings.
+        rng: draws the matches.
+        threshold_rad: maximum Sampson error of an inlier.
+    """
+    candidates = list(poses)
+    for pose in poses:
+        moved = pose
+        # There is a single pose if the search has converged with certainty.
+        for _ in range(2 if len(poses) > 1 else 1):
+            moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
+            candidates.append(moved)
+    costs = facing_costs(candidates, first, second, threshold_rad=threshold_rad)
+    return candidates[int(np.argmin(costs))]
+
+
+def _redirected(
+    pose: Rigid3, first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> Rigid3:
+    # Number of matches on which directions are compared.
+    chosen = rng.choice(len(first), min(1000, len(first)), replace=False)
+    p, q = first[chosen], second[chosen]
+    directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
+    directions = np.concatenate([pose.translation[None], directions])
+    costs = np.concatenate([facing_costs([pose], p, q, threshold_rad=2 * threshold_rad), costs])
+    found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
+    for widen in (2.0, 0.5):
+        found = refine_relative_pose(found, p, q, scale_rad=widen * threshold_rad, max_iterations=8)
+    opposite = Rigid3(found.rotation, -found.translation)
+    costs = facing_costs([found, opposite], p, q, threshold_rad=threshold_rad)
+    return found if costs[0] <= costs[1] else opposite
 
 
 def direction_candidates(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.minimal_solvers import essential_from_bearings
 from pano_mvs.algorithms.two_view.ransac import estimate_rotation
+from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import _linearised, pose_uncertainty, tangent_basis
 from pano_mvs.algorithms.two_view.significance import independent_count, log10_false_alarms
 from pano_mvs.core.errors import UsageError
@@ -86,6 +87,15 @@ def test_recovers_where_three_quarters_of_the_matches_are_wrong(trial: int) -> N
     view = verify_pair(features_from_bearings(p), features_from_bearings(q), matches, rng=rng, max_iterations=6000)
     assert view.geometry == "general", view.reason
     assert max(errors_deg(view.rotation, view.direction, pose)) < 0.4
+
+
+def test_redirection_leaves_a_local_optimum() -> None:
+    """Nearly the right rotation, and a direction that is far off."""
+    rng = rng_of("redirected")
+    p, q, matches, pose = draw(rng, (0.4, -0.1, 0.3), (0.3, 1.0, -0.4), outliers=0.6)
+    wrong = Rigid3(rotation_from_rotvec([0.005, 0.005, -0.005]) @ pose.rotation, np.array([0.0, 1.0, 0.0]))
+    found = best_redirected([wrong], p[matches[:, 0]], q[matches[:, 1]], rng=rng, threshold_rad=0.0035)
+    assert max(errors_deg(found.rotation, found.translation, pose)) < 0.3
 
 
 def test_exact_bearings_give_the_exact_pose() -> None:
