@@ -28,7 +28,7 @@ from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
 
-_LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 64, 200, 5
+_FIT_ROUNDS = 5
 _ALONG_NORMAL = 0.7
 # Cosines of the angles between the two points that a plane is drawn from.
 _PAIR_COSINES = 0.9, 0.9985
@@ -155,7 +155,7 @@ def _level_planes(
         free = np.flatnonzero(points.left & (points.normals @ normal > _ALONG_NORMAL))
         if not len(free):
             return found
-        drawn = rng.choice(free, _LEVEL_DRAWS)
+        drawn = rng.choice(free, 64)
         offsets = points.xyz[drawn] @ normal
         support = [
             points.weight[free][points.on(normal, offset, free, tolerance=tolerance)].sum() for offset in offsets
@@ -201,7 +201,7 @@ def _drawn_upright(points: _Points, free: NDArray[np.intp], rng: np.random.Gener
     if len(free) < 2:
         return []
     found = []
-    for first in rng.choice(free, _UPRIGHT_DRAWS):
+    for first in rng.choice(free, 200):
         others = free[points.view[free] == points.view[first]]
         cosine = points.rays[others] @ points.rays[first]
         others = others[(cosine > _PAIR_COSINES[0]) & (cosine < _PAIR_COSINES[1])]

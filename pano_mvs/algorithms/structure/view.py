@@ -24,7 +24,7 @@ STEP_RAD = np.radians(0.1)
 """Distance of the samples across a crease."""
 HALF_DIFFERENCE = 4
 """Steps from a crease to the two colours that are compared."""
-_BLUR_PX, _MOST_LEVELS, _PAD_PX = 0.7, 40.0, 4
+_PAD_PX = 4
 LEAST_UNCERTAINTY = 0.002
 """Least relative standard deviation of the distance of a plane, and of a point in the fit of one."""
 _ROWS = 256
@@ -141,7 +141,7 @@ def world_rays(azimuth: FloatArray, dip: FloatArray) -> FloatArray:
 
 def blurred(picture: Picture) -> NDArray[np.float32]:
     """Return a panorama (H, W, 3) for `differences`: blurred a little, and padded."""
-    return np.asarray(cv2.GaussianBlur(pad_panorama(picture, _PAD_PX).astype(np.float32), (0, 0), _BLUR_PX))
+    return np.asarray(cv2.GaussianBlur(pad_panorama(picture, _PAD_PX).astype(np.float32), (0, 0), 0.7))
 
 
 def differences(picture: NDArray[np.float32], rays_in_cam: FloatArray, *, axis: int) -> NDArray[np.float32]:
@@ -155,5 +155,6 @@ def differences(picture: NDArray[np.float32], rays_in_cam: FloatArray, *, axis: 
     changes = colors[2 * HALF_DIFFERENCE :] - colors[: -2 * HALF_DIFFERENCE]
     largest = np.abs(changes).max(axis=-1)
     around = cv2.dilate(largest.reshape(len(largest), -1), np.ones((4 * HALF_DIFFERENCE + 1, 1), np.uint8))
-    changes /= np.maximum(around.reshape(largest.shape) / _MOST_LEVELS, 1.0)[..., None]
+    # Changes by more than 40 levels count like those.
+    changes /= np.maximum(around.reshape(largest.shape) / 40.0, 1.0)[..., None]
     return np.asarray(np.moveaxis(changes, 0, axis))
