@@ -430,8 +430,14 @@ def test_a_link_keeps_points_and_coverage(browser: Browser) -> None:
 
 def test_walking_ends_in_the_other_panorama_and_escape_leads_out(browser: Browser) -> None:
     step_inside(browser, 0)
-    browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[1])")
-    browser.wait("PanoMvs.page.move")
+    browser.evaluate(
+        "(() => {"
+        "window.moved = false;"
+        "(function watch() { PanoMvs.page.move ? window.moved = true : requestAnimationFrame(watch) })();"
+        "PanoMvs.page.stepInside(PanoMvs.page.panoramas[1]);"
+        "})()"
+    )
+    browser.wait("window.moved")  # a look from here can miss the whole move
     browser.wait("PanoMvs.page.here.index === 1 && location.hash.startsWith('#i=1,') && PanoMvs.page.settled")
     assert browser.evaluate("PanoMvs.page.eye.position.distanceTo(PanoMvs.page.here.center)") < 1e-6
     browser.press(ESCAPE)
