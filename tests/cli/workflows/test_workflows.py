@@ -310,7 +310,7 @@ def test_mesh_writes_a_textured_mesh_around_the_cameras(pano_mvs: Command, rende
     assert result.code == 0, result.text
     read = trimesh.load(out / "mesh_textured.glb", force="mesh")
     assert isinstance(read, trimesh.Trimesh)
-    assert 500 < len(read.faces) <= 30000
+    assert 500 < len(read.faces) <= 1.25 * 30000  # simplified to about as many
     extent = read.vertices.max(axis=0) - read.vertices.min(axis=0)
     assert int(np.argmin(extent)) == 1  # y is up, and rooms are wider than high
     metrics = next(stage["metrics"] for stage in run_json(out)["stages"] if stage["name"] == "textured")
