@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.error import HTTPError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,10 @@ _ARGUMENTS = (
     "--use-angle=swiftshader",
     "--hide-scrollbars",
 )
+
+
+class DriverError(OSError):
+    """What chromedriver says about a command that it could not do."""
 
 
 class Chromium(Browser):
@@ -75,8 +80,18 @@ class Chromium(Browser):
         _call("POST", f"{self.root}/actions", {"actions": sources_of(source)})
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """Return the window's contents, (H, W, 3) uint8 RGB."""
-        return picture(base64.b64decode(_call("GET", f"{self.root}/screenshot")))
+        """Return the window's contents, (H, W, 3) uint8 RGB.
+
+        While a frame starts a process of its own, or draws for long, Chromium has no picture yet and refuses.
+        """
+        end = time.monotonic() + 60
+        while True:
+            try:
+                return picture(base64.b64decode(_call("GET", f"{self.root}/screenshot")))
+            except DriverError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.2)
 
     def console(self) -> list[str]:
         """Return errors and warnings that the page wrote to the console since the last call."""
@@ -126,8 +141,11 @@ def _call(method: str, address: str, body: Mapping[str, Any] | None = None) -> A
     request = urllib.request.Request(  # our own process
         address, data, {"Content-Type": "application/json"}, method=method
     )
-    with urllib.request.urlopen(request, timeout=120) as answer:
-        return json.load(answer)["value"]
+    try:
+        with urllib.request.urlopen(request, timeout=120) as answer:
+            return json.load(answer)["value"]
+    except HTTPError as error:
+        raise DriverError(error.read().decode(errors="replace")) from error
 
 
 def _wait_for(address: str) -> None:
