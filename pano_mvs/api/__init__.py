@@ -43,9 +43,9 @@ from pano_mvs.geometry import (
     sample_panorama,
 )
 from pano_mvs.geometry.geodesy import lla_from_local
-from pano_mvs.io.thinning import CHUNK_POINTS, chunks, select_points
-from pano_mvs.io.thinning import SelectedPoints as KeptPoints
-from pano_mvs.io.thinning import Selection as PointSelection
+from pano_mvs.io.point_selection import CHUNK_POINTS, chunks, select_points
+from pano_mvs.io.point_selection import SelectedPoints as KeptPoints
+from pano_mvs.io.point_selection import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,
     Features,

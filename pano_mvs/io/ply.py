@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.thinning import SelectedPoints, chunks
+from pano_mvs.io.point_selection import SelectedPoints, chunks
 from pano_mvs.scene import FilePart, PointCloud
 
 RGB = ("red", "green", "blue")

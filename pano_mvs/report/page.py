@@ -17,7 +17,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
-from pano_mvs.results.pictures import probability_color
+from pano_mvs.results.colors import probability_color
 from pano_mvs.results.records import Verdict
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary

@@ -1,4 +1,4 @@
-"""Images embedded in a page: which are chosen, JPEG files of limited size as data URIs, and colours of figures."""
+"""Images embedded in a page: which are chosen, and JPEG files of limited size as data URIs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pano_mvs.core.file_names import file_inside
 
@@ -86,19 +86,3 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
     # They are separated by a white line; the scale is below.
     start = height if small else height + 4
     return rgb[:height], rgb[start : start + height]
-
-
-_RED_YELLOW_GREEN = np.array([(199, 38, 74), (250, 204, 77), (26, 153, 115)], np.float64)
-
-
-def ramp_rgb(values: ArrayLike, stops: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the colours (..., 3) of values (...), which are red, yellow and green at three increasing stops."""
-    found = np.asarray(values, np.float64)
-    channels = [np.interp(found, stops, _RED_YELLOW_GREEN[:, idx]) for idx in range(3)]
-    return np.stack(channels, axis=-1).astype(np.uint8)
-
-
-def probability_color(probability: float) -> str:
-    """Return the colour of a probability that a pose is right, as `#rrggbb`."""
-    # As likely wrong, the default limit of a doubt, and as sure as can be.
-    return f"#{bytes(ramp_rgb(probability, (0.5, 5 / 6, 0.99))).hex()}"

@@ -14,7 +14,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import path_inside
 from pano_mvs.geometry import Rigid3
-from pano_mvs.results.pictures import ramp_rgb
+from pano_mvs.results.colors import ramp_rgb
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart, PointCloud
 from pano_mvs.scene.image_file import decode_image

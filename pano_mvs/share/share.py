@@ -19,8 +19,8 @@ from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.core.paths import resolved
 from pano_mvs.core.yaml_text import parse_yaml
 from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
+from pano_mvs.results.colors import probability_color
 from pano_mvs.results.figures import share as share_text
-from pano_mvs.results.pictures import probability_color
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import FilePart, PointCloud, Poses

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.learned.weak_images import learned_pairs
-from pano_mvs.algorithms.matching.neighbours import (
+from pano_mvs.algorithms.matching.pair_selection import (
     automatic_pairs,
     east_north_m,
     exhaustive_pairs,

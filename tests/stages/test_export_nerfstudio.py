@@ -14,10 +14,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pano_mvs.api import FilePart, InputError, Panorama, Poses, RangeMap
-from pano_mvs.io import splats
+from pano_mvs.io import transforms_json
 from pano_mvs.io.ply import open_ply_points
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.splats import NerfstudioFrame
+from pano_mvs.io.transforms_json import NerfstudioFrame
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import NerfstudioFramesParams, NerfstudioParams, nerfstudio, nerfstudio_frames
 from pano_mvs.testing.room import default_room, range_along
@@ -313,5 +313,5 @@ def test_frames_are_read_with_one_schema(monkeypatch: pytest.MonkeyPatch) -> Non
     turned = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
     frame = NerfstudioFrame("faces", "a.png", "", "a_depth.png", (64, 64), (32.0, 32.0), turned, radial=0.1)
     document = json.loads(json.dumps(frame.to_json()))
-    monkeypatch.delattr(splats, "TypeAdapter")
+    monkeypatch.delattr(transforms_json, "TypeAdapter")
     assert NerfstudioFrame.from_json(document) == frame

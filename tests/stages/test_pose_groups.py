@@ -20,7 +20,7 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.ply import read_ply
-from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
+from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras

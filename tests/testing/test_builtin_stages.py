@@ -11,7 +11,7 @@ from _pytest.mark.structures import ParameterSet
 from pano_mvs.algorithms.learned import aliked
 from pano_mvs.algorithms.learned.aliked import level_tiles
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
+from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.algorithms.learned.grey_network import GREY_NETWORK

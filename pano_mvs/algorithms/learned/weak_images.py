@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from pano_mvs.algorithms.matching.neighbours import retrieval_pairs, similarities
+from pano_mvs.algorithms.matching.pair_selection import retrieval_pairs, similarities
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Pairs, TwoView, WeakImages

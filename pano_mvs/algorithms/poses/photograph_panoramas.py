@@ -100,7 +100,7 @@ def similar_panoramas(
 ) -> list[list[str]]:
     """Return, for each photograph, the names of the panoramas that match its strongest key points best, in given order.
 
-    As in `neighbours.sample_matches`, the number of mutual matches of a sample decides; here, the sample of the
+    As in `pair_selection.sample_matches`, the number of mutual matches of a sample decides; here, the sample of the
     photograph is matched with all key points of each panorama, of which a photograph shows a small part. Of equal
     panoramas, the first are taken. The panoramas are iterated over once, and no descriptors of theirs are kept.
 

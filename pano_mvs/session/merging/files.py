@@ -21,9 +21,9 @@ from pano_mvs.geometry import Similarity3
 from pano_mvs.io.colmap.reader import model_files, read_cameras, read_images
 from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.ply import open_ply_points, write_ply_parts
+from pano_mvs.io.point_selection import chunks
 from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
-from pano_mvs.io.splats import NerfstudioFrame, transforms_document
-from pano_mvs.io.thinning import chunks
+from pano_mvs.io.transforms_json import NerfstudioFrame, transforms_document
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.run_output import RunOutput, RunView, load
 from pano_mvs.results.summary import RunSummary

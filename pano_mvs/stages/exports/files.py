@@ -31,6 +31,7 @@ from pano_mvs.api import (
 )
 from pano_mvs.io.images.preview import write_preview
 from pano_mvs.io.ply import write_ply
+from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.io.poses.metashape import write_metashape
 from pano_mvs.io.poses.other_json import write_openmvg
 from pano_mvs.io.ranges import (
@@ -43,7 +44,6 @@ from pano_mvs.io.ranges import (
     write_range_png,
     write_range_tiff,
 )
-from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.io.tiles_3d import TilesetWriter
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups

@@ -49,7 +49,7 @@ from pano_mvs.io.meshes import (
     write_usdz,
 )
 from pano_mvs.io.ply import read_ply, read_ply_mesh, write_ply, write_ply_mesh
-from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.pose_groups import split_groups

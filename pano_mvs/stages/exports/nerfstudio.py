@@ -10,10 +10,10 @@ import numpy as np
 
 from pano_mvs.algorithms.faces.layout import panorama_faces
 from pano_mvs.api import All, Context, Each, Files, One, Panorama, PointCloud, Poses, RangeMap, arguments_from, stage
-from pano_mvs.io.splats import NerfstudioFrames
+from pano_mvs.io.transforms_json import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.files import FrameParams, files_from_world
-from pano_mvs.stages.exports.frame_files import (
+from pano_mvs.stages.exports.transforms import (
     FrameFiles,
     FramesParams,
     Layers,

@@ -32,13 +32,20 @@ from pano_mvs.core.paths import children
 from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap.workspace import write_picture
 from pano_mvs.io.colmap.writer import CutPanorama, write_colmap_model, write_rig_model
-from pano_mvs.io.splats import ROOT, BundleView, NerfstudioFrame, PanoramaFrames, SplatFrames, manifest_document
+from pano_mvs.io.transforms_json import (
+    ROOT,
+    BundleView,
+    NerfstudioFrame,
+    PanoramaFrames,
+    SplatFrames,
+    manifest_document,
+)
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups, with_cameras
 from pano_mvs.scene.surfaces import TrackedPoints
-from pano_mvs.stages.exports.frame_files import (
+from pano_mvs.stages.exports.transforms import (
     FrameFiles,
     FramesParams,
     Layers,

@@ -11,7 +11,7 @@ import numpy as np
 import pye57
 import pytest
 from pano_mvs.api import Context, InputError, Panorama, Params, PointCloud, Poses, Rigid3, UsageError, ray_from_pixel
-from pano_mvs.io import thinning
+from pano_mvs.io import point_selection
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from pyproj import CRS, Transformer
@@ -166,7 +166,7 @@ def test_points_that_are_not_wanted_are_left_out_in_any_cut(
     assert cloud.confidence is not None
     good = int(((cloud.view_counts >= 4) & (cloud.confidence >= 60)).sum())
     assert 0.5 * good < count <= good
-    monkeypatch.setattr(thinning, "CHUNK_POINTS", 64)
+    monkeypatch.setattr(point_selection, "CHUNK_POINTS", 64)
     again = written(stage, tmp_path / "b", cloud, the_poses(), wanted)
     if stage is las:
         np.testing.assert_array_equal(laspy.read(again).xyz, laspy.read(whole).xyz)

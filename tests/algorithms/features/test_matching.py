@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.matching.neighbours import exhaustive_pairs, sequential_pairs
+from pano_mvs.algorithms.matching.pair_selection import exhaustive_pairs, sequential_pairs
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import Features
 from tests.oracles.features import match_one_by_one

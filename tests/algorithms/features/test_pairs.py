@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.matching.neighbours import (
+from pano_mvs.algorithms.matching.pair_selection import (
     automatic_pairs,
     east_north_m,
     exhaustive_pairs,

@@ -19,7 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pano_mvs.algorithms.matching.neighbours import retrieval_pairs
+from pano_mvs.algorithms.matching.pair_selection import retrieval_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation

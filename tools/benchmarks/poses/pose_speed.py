@@ -26,7 +26,7 @@ import numpy as np
 
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.matching.neighbours import exhaustive_pairs, retrieval_pairs
+from pano_mvs.algorithms.matching.pair_selection import exhaustive_pairs, retrieval_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from pano_mvs.api import Context, PointCloud
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io import thinning
+from pano_mvs.io import point_selection
 from pano_mvs.io.ply import read_ply, write_ply
-from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.stages.exports.files import PlyParams, ply
 
 
@@ -81,8 +81,8 @@ def test_how_the_work_is_cut_up_changes_nothing(
     write_ply(tmp_path / "whole.ply", cloud, kept=select_points(cloud, selection, tmp_path), quality=True)
     reference = (tmp_path / "whole.ply").read_bytes()
     (tmp_path / "whole.ply").unlink()
-    monkeypatch.setattr(thinning, "CHUNK_POINTS", chunk)
-    monkeypatch.setattr(thinning, "_BUCKET_POINTS", bucket)
+    monkeypatch.setattr(point_selection, "CHUNK_POINTS", chunk)
+    monkeypatch.setattr(point_selection, "_BUCKET_POINTS", bucket)
     assert kept_idx(cloud, selection, tmp_path) == whole
     write_ply(tmp_path / "again.ply", cloud, kept=select_points(cloud, selection, tmp_path), quality=True)
     assert (tmp_path / "again.ply").read_bytes() == reference
@@ -151,7 +151,7 @@ import tracemalloc
 import numpy as np
 from pathlib import Path
 from pano_mvs.io.ply import write_ply
-from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.scene import PointCloud
 
 folder, count = Path(sys.argv[1]), int(sys.argv[2])

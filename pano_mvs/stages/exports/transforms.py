@@ -33,8 +33,9 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.workspace import write_picture
 from pano_mvs.io.ply import write_ply
+from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.io.ranges import write_confidence_png, write_normals_png, write_range_png
-from pano_mvs.io.splats import (
+from pano_mvs.io.transforms_json import (
     NerfstudioFrame,
     PanoramaFrames,
     Variant,
@@ -42,7 +43,6 @@ from pano_mvs.io.splats import (
     open_mask,
     transforms_document,
 )
-from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
