@@ -374,16 +374,18 @@ def merge_blocks(
             scale=world.scale,
             metric=world.metric,
         ),
-        doubts={name: blocks[owner[name]].doubts[name] for name in names if name in blocks[owner[name]].doubts},
-        **_shares(blocks, names, owner),
+        **_known(blocks, names, owner),
     )
     return MergedBlocks(_with_points(merged, blocks, world_from_block), home)
 
 
-def _shares(blocks: Sequence[Poses], names: Sequence[str], owner: Mapping[str, int]) -> dict[str, Any]:
-    """Return what images confirm of the cameras, by field; a field that no block has is left out."""
+def _known(blocks: Sequence[Poses], names: Sequence[str], owner: Mapping[str, int]) -> dict[str, Any]:
+    """Return what is known of the cameras, by field; a field that no block has is left out."""
     positions = [{name: idx for idx, name in enumerate(block.names)} for block in blocks]
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {
+        field: {name: own[name] for name in names if name in (own := getattr(blocks[owner[name]], field))}
+        for field in ("evidence", "doubts")
+    }
     for field in ("confirmed_shares", "expected_shares", "right_probabilities"):
         columns = [getattr(block, field) for block in blocks]
         if all(column is None for column in columns):

@@ -18,7 +18,7 @@ ALONE = "no other image shares its frame, so its position is meaningless"
 def split_groups(poses: Poses) -> list[Poses]:
     """Return the groups of poses, the largest first, each as poses of one group.
 
-    A group has its own cameras, in the capture's order, with their points, tracks and doubts, and its own
+    A group has its own cameras, in the capture's order, with their points, tracks, evidence and doubts, and its own
     frame and scale. Points that no camera sees go to group 0. Poses of one group are returned as they are; with several
     groups, `rejected` of each is empty.
     """
@@ -135,6 +135,7 @@ def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_],
         metric=world.metric,
         group_idx=None,
         other_worlds=(),
+        evidence={name: poses.evidence[name] for name in names if name in poses.evidence},
         doubts={name: poses.doubts[name] for name in names if name in poses.doubts},
         **{name: None if value is None else value[cameras] for name, value in values.items()},
     )
@@ -175,6 +176,7 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         track_sigmas_rad=np.concatenate(known) if len(known) == len(groups) else None,
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
+        evidence={name: row for group in groups for name, row in group.evidence.items()},
         doubts={name: why for group in groups for name, why in group.doubts.items()},
         **_joined_values(groups, order),
     )
