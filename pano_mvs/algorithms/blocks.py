@@ -29,6 +29,7 @@ from pano_mvs.geometry import (
     similarity_from_points,
 )
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import values_of_cameras, with_cameras
 
 
 def divide_capture(
@@ -365,6 +366,13 @@ def merge_blocks(
     names = tuple(name for name in order if name in owner)
     home = np.array([owner[name] for name in names], np.intp)
     final = [cameras[owner[name]][name] for name in names]
+    own = [
+        with_cameras(
+            replace(block, center_stds=None, rotation_stds_rad=None),
+            np.array([owner[name] == number for name in block.names], np.bool_),
+        )
+        for number, block in enumerate(blocks)
+    ]
     world = blocks[reference].worlds[0]
     merged = replace(
         Poses.without_points(
@@ -374,27 +382,9 @@ def merge_blocks(
             scale=world.scale,
             metric=world.metric,
         ),
-        doubts={name: blocks[owner[name]].doubts[name] for name in names if name in blocks[owner[name]].doubts},
-        **_shares(blocks, names, owner),
+        **values_of_cameras(own, names),
     )
     return MergedBlocks(_with_points(merged, blocks, world_from_block), home)
-
-
-def _shares(blocks: Sequence[Poses], names: Sequence[str], owner: Mapping[str, int]) -> dict[str, Any]:
-    """Return what images confirm of the cameras, by field; a field that no block has is left out."""
-    positions = [{name: idx for idx, name in enumerate(block.names)} for block in blocks]
-    found: dict[str, Any] = {}
-    for field in ("confirmed_shares", "expected_shares", "right_probabilities"):
-        columns = [getattr(block, field) for block in blocks]
-        if all(column is None for column in columns):
-            continue
-        found[field] = np.array(
-            [
-                np.nan if columns[owner[name]] is None else columns[owner[name]][positions[owner[name]][name]]
-                for name in names
-            ]
-        )
-    return found
 
 
 def adjust_merged(merged: MergedBlocks) -> MergedBlocks:

@@ -156,6 +156,8 @@ class PosesSummary(OptionalEntry):
     doubts: Mapping[str, str] = {}  # registered image whose pose is doubtful to the reason
     # image to the share of its texture that other images confirm, and the share that is expected
     confirmed: Mapping[str, tuple[float | None, float | None]] = {}
+    # image to what was measured for and against its pose, by measurement; None where it is missing
+    evidence: Mapping[str, Mapping[str, float | None]] = {}
     # image to the probability that its pose is right; None where nothing was measured about it
     p_right: Mapping[str, float | None] = {}
     centers: tuple[Direction, ...] = ()  # of the registered cameras in the world, in the order of `registered`

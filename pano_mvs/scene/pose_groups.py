@@ -18,7 +18,7 @@ ALONE = "no other image shares its frame, so its position is meaningless"
 def split_groups(poses: Poses) -> list[Poses]:
     """Return the groups of poses, the largest first, each as poses of one group.
 
-    A group has its own cameras, in the capture's order, with their points, tracks and doubts, and its own
+    A group has its own cameras, in the capture's order, with their points, tracks, evidence and doubts, and its own
     frame and scale. Points that no camera sees go to group 0. Poses of one group are returned as they are; with several
     groups, `rejected` of each is empty.
     """
@@ -135,6 +135,7 @@ def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_],
         metric=world.metric,
         group_idx=None,
         other_worlds=(),
+        evidence={name: poses.evidence[name] for name in names if name in poses.evidence},
         doubts={name: poses.doubts[name] for name in names if name in poses.doubts},
         **{name: None if value is None else value[cameras] for name, value in values.items()},
     )
@@ -150,6 +151,7 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
     """Return groups, numbered as they come, with their cameras in the capture's order."""
     names = [name for group in groups for name in group.names]
     order = np.array(sorted(range(len(names)), key=lambda idx: position[names[idx]]), np.intp)
+    ordered = tuple(names[idx] for idx in order)
     place = np.argsort(order).astype(np.int32)
     first_camera = np.cumsum([0, *(len(group.names) for group in groups)])
     first_point = np.cumsum([0, *(len(group.points_in_world) for group in groups)])
@@ -163,7 +165,7 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
     known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
     return replace(
         groups[0],
-        names=tuple(names[idx] for idx in order),
+        names=ordered,
         rotations=joined("rotations")[order],
         translations=joined("translations")[order],
         points_in_world=joined("points_in_world"),
@@ -175,14 +177,21 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         track_sigmas_rad=np.concatenate(known) if len(known) == len(groups) else None,
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
-        doubts={name: why for group in groups for name, why in group.doubts.items()},
-        **_joined_values(groups, order),
+        **values_of_cameras(groups, ordered),
     )
 
 
-def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the values per camera, NaN for groups without them; None if no group has them."""
-    joined = {}
+def values_of_cameras(groups: Sequence[Poses], names: Sequence[str]) -> dict[str, Any]:
+    """Return what is known of each camera of several groups, by field of `Poses`.
+
+    Values per camera are in the order of names, NaN for groups without them, and None if no group has them.
+    """
+    place = {name: idx for idx, name in enumerate(name for group in groups for name in group.names)}
+    order = np.array([place[name] for name in names], np.intp)
+    joined: dict[str, Any] = {
+        field: {name: value for group in groups for name, value in getattr(group, field).items()}
+        for field in ("evidence", "doubts")
+    }
     for field in PER_CAMERA:
         known = [getattr(group, field) for group in groups]
         filled = [

@@ -99,6 +99,8 @@ class Poses(Record):
         expected_shares: (N,) float64 the expected share, from the neighbouring cameras.
         right_probabilities: (N,) float64 probability that each pose is right, by all that was measured about it; NaN
             where nothing was; None if not computed, or if the images turned out not to be full spheres.
+        evidence: name of each image to what was measured for and against its pose, by measurement; None where it is
+            missing. `pano_mvs.algorithms.poses.verification.belief.evidence` says what is measured.
         doubts: name of every registered image whose pose is doubtful, with the reason.
         track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
             observations by it. None: unknown, equal weights.
@@ -127,6 +129,7 @@ class Poses(Record):
     confirmed_shares: NDArray[np.float64] | None = None
     expected_shares: NDArray[np.float64] | None = None
     right_probabilities: NDArray[np.float64] | None = None
+    evidence: dict[str, dict[str, float | None]] = field(default_factory=dict)
     doubts: dict[str, str] = field(default_factory=dict)
     other_worlds: tuple[World, ...] = ()
     track_sigmas_rad: NDArray[np.float32] | None = None
@@ -216,6 +219,7 @@ class Poses(Record):
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
         require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")
+        require(self.evidence.keys() <= set(self.names), self, "there is evidence for an image that is not registered")
         if tracks:
             require(positions_fit(self.track_point_idx, points), self, "a track has no point")
             require(positions_fit(self.track_image_idx, images), self, "a track has no image")

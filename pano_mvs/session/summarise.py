@@ -194,6 +194,10 @@ def poses_summary(
         rejected=rejected,
         doubts=doubts,
         confirmed=_confirmed(poses),
+        evidence={
+            name: {key: value if value is None else float(f"{value:.4g}") for key, value in row.items()}
+            for name, row in poses.evidence.items()
+        },
         p_right=_probabilities(poses),
         centers=poses.centers.tolist(),
         points=len(poses.points_in_world),

@@ -56,6 +56,8 @@ def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context
                 ctx.note(f"{which}upside down unlike the others, which the poses allow for: {', '.join(over)}")
             if not number:
                 ctx.metric("uncertainty_deg", vertical.uncertainty_deg)
+                for source, weight in vertical.weights.items():
+                    ctx.metric(f"weight_{source}", weight)
                 if np.isfinite(vertical.disagreement_deg):
                     ctx.metric("disagreement_deg", vertical.disagreement_deg)
     return join_groups(levelled, order=poses.names, rejected=poses.rejected)

@@ -149,6 +149,7 @@ POSES = [
     "rejected",
     "doubts",
     "confirmed",
+    "evidence",
     "p_right",
     "centers",
     "points",

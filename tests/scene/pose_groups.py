@@ -36,6 +36,7 @@ def drawn_group(names: tuple[str, ...], *, seed: int, points: int = 30, frame: s
         metric=known.metric,
         center_stds=rng.random(len(names)),
         rotation_stds_rad=rng.random(len(names)),
+        evidence={names[0]: {"share": float(seed), "repeats": None}},
         doubts={names[-1]: f"doubt {seed}"},
         track_sigmas_rad=rng.uniform(1e-4, 1e-3, points * len(names)).astype(np.float32),
     )

@@ -38,6 +38,7 @@ KINDS: dict[str, Record] = {
         confirmed_shares=np.ones(3),
         expected_shares=np.full(3, 0.5),
         right_probabilities=np.full(3, 0.9),
+        evidence={"a": {"share": 1.0, "repeats": None}},
     ),
     "range map": RangeMap(np.ones((2, 4), np.float32), np.full((2, 4), 200, np.uint8)),
     "samples": SurfaceSamples(UNITS, FLOATS, COLORS, BYTES),

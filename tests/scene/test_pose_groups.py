@@ -33,6 +33,7 @@ def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is
     assert [world.metric for world in joined.worlds] == [True, False]
     assert joined.rejected == {"f.jpg": "blurred"}
     assert joined.doubts == {"c.jpg": "doubt 2", "e.jpg": "doubt 1"}
+    assert {name: row["share"] for name, row in joined.evidence.items()} == {"a.jpg": 2.0, "b.jpg": 1.0}
 
 
 def test_of_two_groups_of_one_size_the_one_with_the_earliest_image_is_first() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
@@ -74,6 +75,10 @@ def test_without_matches_or_permission_it_only_reports(
     poses = verified(tiny, ctx, matched=matched, correct=correct)
     assert set(poses.doubts) == {WRONG}
     assert poses.right_probabilities is not None
+    for row, probability in zip(poses.evidence.values(), poses.right_probabilities, strict=True):
+        assert matched or row["agreeing"] is None
+        known = {name: np.nan if value is None else value for name, value in row.items()}
+        assert FITTED.probability(known) == pytest.approx(probability)
     assert ctx.metrics["p_right_lowest"] == poses.right_probabilities.min()
     assert ctx.metrics["registered_rightly"] == pytest.approx(poses.right_probabilities.mean())
     assert ctx.notes == []

@@ -225,7 +225,7 @@ def _write_models(group: PosedGroup, poses: Poses, *, ctx: Context) -> dict[str,
             kept = with_cameras(poses, np.array([name in frames for name in poses.names]))
             names = tuple(_image_name(name, frames[name]) for name in kept.names)
             sizes = {image: frames[name].size_wh[::-1] for image, name in zip(names, kept.names, strict=True)}
-            write_colmap_model(folder, replace(kept, names=names, doubts={}), sizes, form="bin")
+            write_colmap_model(folder, replace(kept, names=names, evidence={}, doubts={}), sizes, form="bin")
         target = f"{ROOT}/{variant}/sparse/{group.number}"
         files |= {f"{target}/{path.name}": path for path in children(folder)}
     return files

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,10 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pano_mvs.algorithms.blocks import BlockAlignment, align_blocks, divide_capture, similarity_from_cameras
+from pano_mvs.algorithms.blocks import (
+    BlockAlignment,
+    align_blocks,
+    divide_capture,
+    merge_blocks,
+    similarity_from_cameras,
+)
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from tests.algorithms.blocks.walked_blocks import bent, block_of, some_world, walk
+from tests.scene.pose_groups import drawn_group
 
 NAMES = [f"{idx:03d}.png" for idx in range(200)]
 
@@ -139,3 +147,17 @@ def test_a_block_with_too_few_common_cameras_is_left_out() -> None:
     alignment = align_blocks(blocks)
     assert alignment.world_from_block[1] is None
     assert alignment.links == ()
+
+
+def test_each_camera_keeps_what_its_own_block_knows_of_it() -> None:
+    first = replace(drawn_group(("a", "b", "c"), seed=1), right_probabilities=np.array([0.1, 0.2, 0.3]))
+    second = drawn_group(("c", "d", "e"), seed=2)
+    merged = merge_blocks([first, second], [Similarity3(1.0, np.eye(3), np.zeros(3))] * 2, order="abcde", reference=0)
+    of_first = merged.owner == 0
+    assert merged.poses.right_probabilities is not None
+    assert np.isnan(merged.poses.right_probabilities).tolist() == (~of_first).tolist()
+    np.testing.assert_array_equal(merged.poses.right_probabilities[:2], [0.1, 0.2])
+    assert merged.poses.evidence.get("c") == (None if of_first[2] else second.evidence["c"])
+    assert merged.poses.evidence["a"] == first.evidence["a"]
+    assert merged.poses.doubts["e"] == second.doubts["e"]
+    assert merged.poses.center_stds is None

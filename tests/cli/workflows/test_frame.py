@@ -119,7 +119,8 @@ def test_sensors_level_a_turned_world(pano_mvs: Command, capture: Path, turned: 
     for name, pose in turned.items():
         write_sensors(capture / "images" / name, pose.rotation @ UP)
     workflow = capture.parent / "level.yaml"
-    workflow.write_text(KNOWN + "  level: {use: poses.level}\n  twice: {use: poses.scale, factor: 2}\n")
+    stages = "  level: {use: poses.level, evidence: sensors}\n  twice: {use: poses.scale, factor: 2}\n"
+    workflow.write_text(KNOWN + stages)
     result = pano_mvs("run", workflow, "--out", "out")
     assert result.code == 0, result.text
     told = run_json(Path("out"))["poses"]

@@ -214,7 +214,8 @@ class DoubtingParams(Params):
 @stage("poses.doubting")
 def doubting(poses: One[Poses], params: DoubtingParams, ctx: Context) -> Poses:
     count = len(poses.names)
-    return replace(poses, doubts=params.doubts, confirmed_shares=np.full(count, 0.25),
+    return replace(poses, doubts=params.doubts, evidence={"000.png": {"share": 0.25, "repeats": None}},
+                   confirmed_shares=np.full(count, 0.25),
                    expected_shares=np.array([0.5] * (count - 1) + [np.nan]),
                    right_probabilities=np.array([0.9] * (count - 1) + [np.nan]))
 """
@@ -283,6 +284,7 @@ def test_a_doubtful_camera_is_said_once_and_the_run_ends_with_code_3_every_time(
             "002.png": [0.25, 0.5],
             "003.png": [0.25, None],
         }
+        assert summary["poses"]["evidence"] == {"000.png": {"share": 0.25, "repeats": None}}
         assert summary["poses"]["p_right"] == {"000.png": 0.9, "001.png": 0.9, "002.png": 0.9, "003.png": None}
 
 

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.learned.weak_images import learned_pairs, weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
-from pano_mvs.algorithms.poses.verification.verify_poses import VerifiedGroup, verified_group
+from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
@@ -171,7 +171,7 @@ def _displaced(poses: Poses, rng: np.random.Generator) -> Poses:
 def rows_of(
     capture: Capture,
     variant: str,
-    found: VerifiedGroup,
+    found: Poses,
     *,
     group: int,
     learned: bool,
@@ -182,12 +182,12 @@ def rows_of(
     Args:
         capture: with the truth.
         variant: how the group was solved.
-        found: the group with what was measured.
+        found: the poses of the group, with the evidence for each.
         group: its number.
         learned: whether the capture has learned matches.
         limits: errors up to which a camera is right, in degrees and as a share of the extent.
     """
-    placed = judge_placements(found.poses, capture.truth, rotation_limit_deg=limits[0], center_limit=limits[1])
+    placed = judge_placements(found, capture.truth, rotation_limit_deg=limits[0], center_limit=limits[1])
     return [
         asdict(
             Measured(
@@ -202,10 +202,7 @@ def rows_of(
                 float(placed.rotation_deg[idx]),
                 float(placed.center_shares[idx]),
                 bool(placed.doubted[idx]),
-                {
-                    key: float(value) if np.isfinite(value) else None
-                    for key, value in found.checks.evidence[found.model.pairs.names.index(name)].items()
-                },
+                found.evidence[name],
             )
         )
         for idx, name in enumerate(placed.names)

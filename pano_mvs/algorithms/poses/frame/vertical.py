@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Literal
 
@@ -41,7 +41,7 @@ class Vertical:
     """The direction away from gravity; falsy, with the reason, if it is unknown."""
 
     up_in_world: FloatArray  # (3,) unit vector
-    source: str = ""  # "sensors", "lines", "structure" or "cameras"
+    source: str = ""  # "sensors", "lines", "structure" or "cameras"; of several, the most precise one
     evidence: str = ""  # description of the source, with its amount and agreement
     # median angle between single readings and `up_in_world`; NaN if there is only one
     disagreement_deg: float = float("nan")
@@ -50,6 +50,7 @@ class Vertical:
     # probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on, `up_in_world` is
     # opposite to their up direction.
     upside_down: float = float("nan")
+    weights: Mapping[str, float] = field(default_factory=dict)  # of each source of `up_in_world`; their sum is 1
 
     def __bool__(self) -> bool:
         return not self.reason
@@ -70,31 +71,42 @@ def find_vertical(
         pictures: image name to a function that loads its panorama, for `lines`.
         evidence: "sensors" of the cameras; vertical "lines" in the pictures, or the "structure" of floors, ceilings and
             tables, within 20° of the cameras' mean up direction; the up directions of the "cameras" alone; or "auto":
-            the first of these, in this order, that can be used. With "auto", a vertical that does not come from sensors
-            is turned around if the capture is upside down (see `pano_mvs.algorithms.poses.frame.upside_down`).
+            the mean of the most precise of these and of those that agree with it. With "auto", sensors decide which way
+            is up; without them, the vertical is turned around if the capture is upside down (see
+            `pano_mvs.algorithms.poses.frame.upside_down`).
     """
+    sensors, cameras = vertical_from_sensors(poses, up_in_cam or {}), vertical_from_cameras(poses)
+    prior = sensors if sensors and evidence == "auto" else cameras
     finders: dict[str, Callable[[], Vertical]] = {
-        "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
-        "lines": lambda: vertical_from_lines(poses, pictures or {}),
-        "structure": lambda: vertical_from_structure(poses),
-        "cameras": lambda: vertical_from_cameras(poses),
+        "sensors": lambda: sensors,
+        "lines": lambda: _from_lines(poses, pictures or {}, prior),
+        "structure": lambda: _from_structure(poses, prior),
+        "cameras": lambda: cameras,
     }
-    reasons = []
-    for find in finders.values() if evidence == "auto" else [finders[evidence]]:
-        vertical = find()
-        if vertical:
-            return (
-                vertical if evidence != "auto" or vertical.source == "sensors" else _upright(vertical, poses, pictures)
-            )
-        reasons.append(vertical.reason)
-    return _unknown("; ".join(dict.fromkeys(reasons)))
-
-
-def _upright(vertical: Vertical, poses: Poses, pictures: Mapping[str, Picture] | None) -> Vertical:
-    """Return a vertical that points up even if the cameras were upside down."""
+    found = [find() for name, find in finders.items() if evidence in ("auto", name)]
+    known = [each for each in found if each and (not prior or each.up_in_world @ prior.up_in_world > 0)]
+    if not known:
+        return _unknown("; ".join(dict.fromkeys(each.reason for each in found)))
+    vertical = _mean_of_agreeing(known)
+    if sensors or evidence != "auto":
+        return vertical
     probability = upside_down_probability(poses, pictures or {}, vertical.up_in_world)
     up = -vertical.up_in_world if probability >= SURE else vertical.up_in_world
     return replace(vertical, up_in_world=up, upside_down=probability)
+
+
+def _mean_of_agreeing(known: Sequence[Vertical]) -> Vertical:
+    """Return the mean, by precision, of the most precise vertical and of those that agree with it."""
+    lead = min(known, key=lambda each: each.uncertainty_deg)
+    ups = np.array([each.up_in_world for each in known])
+    variances = np.array([each.uncertainty_deg**2 for each in known])
+    # A chi-square test with two degrees of freedom: one in twenty that measure the same is refused.
+    agrees = np.rad2deg(angle_between(ups, lead.up_in_world)) ** 2 <= -np.log(0.05) * (variances + variances.min())
+    weights = agrees / variances
+    up = weights @ ups / np.linalg.norm(weights @ ups)
+    shares = zip([each.source for each in known], (weights / weights.sum()).tolist(), strict=True)
+    named = {source: share for source, share in shares if share}
+    return replace(lead, up_in_world=up, weights=named, uncertainty_deg=float(weights.sum() ** -0.5))
 
 
 def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]) -> Vertical:
@@ -119,10 +131,11 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
 
 def vertical_from_cameras(poses: Poses) -> Vertical:
     """Return the robust mean of the cameras' up directions: panoramas are taken with the camera nearly upright."""
-    if len(poses.names) < 2:
-        return _unknown("a single camera does not determine the vertical")
+    if not poses.names:
+        return _unknown("there is no camera")
     up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ UP)
-    disagreement_deg = float(np.median(deviations_deg))
+    # A single camera is usually held this far from upright.
+    disagreement_deg = float(np.median(deviations_deg)) if len(poses.names) > 1 else 2.0
     # Cameras whose up directions differ by more than this were not held upright.
     if disagreement_deg > 20.0:
         return _unknown(
@@ -133,20 +146,17 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
     return Vertical(up, "cameras", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
-def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertical:
-    """Return the direction near the cameras' mean up direction to which most line segments in the pictures point.
+def _from_lines(poses: Poses, pictures: Mapping[str, Picture], prior: Vertical) -> Vertical:
+    """Return the direction near a prior one to which most line segments in the pictures point.
 
-    One camera suffices: its own up direction is where the search begins. Cameras that were turned in all directions
-    have no common one; then brightness, texture and the floor show which of three axes of the lines is vertical.
+    Cameras that were turned in all directions have no common up direction; then brightness, texture and the floor show
+    which of three axes of the lines is vertical.
     """
-    prior = vertical_from_cameras(poses) if len(poses.names) > 1 else _of_one_camera(poses)
     rotations = dict(zip(poses.names, poses.rotations, strict=True))
     if not prior:
         return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if pictures else prior
     lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
-    return _near_cameras(
-        lines, prior, "lines", what="vertical lines are", evidence=f"{lines.count} vertical lines in the pictures"
-    )
+    return _near(lines, prior, "lines", evidence=f"{lines.count} vertical lines in the pictures")
 
 
 def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: Segments) -> Vertical:
@@ -169,29 +179,23 @@ def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: 
     return Vertical(lines.up, "lines", evidence, uncertainty_deg=lines.uncertainty_deg)
 
 
-def vertical_from_structure(poses: Poses) -> Vertical:
-    """Return the direction near the cameras' mean up direction along which sparse points lie in the sharpest layers."""
-    prior = vertical_from_cameras(poses)
+def _from_structure(poses: Poses, prior: Vertical) -> Vertical:
+    """Return the direction near a prior one along which sparse points lie in the sharpest layers."""
     if not prior:
         return prior
     layers = sharpest_up(poses.points_in_world, poses.centers, prior.up_in_world)
-    moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
-    evidence = (
-        f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
-        f"of {len(poses.names)} cameras"
-    )
-    return _near_cameras(layers, prior, "structure", what="layers of sparse points are", evidence=evidence)
+    evidence = f"the level surfaces among {len(poses.points_in_world)} sparse points"
+    return _near(layers, prior, "structure", evidence=evidence)
 
 
-def _near_cameras(found: Upward, prior: Vertical, source: str, *, what: str, evidence: str) -> Vertical:
-    """Return a direction as the vertical, unless it is too far from that of the cameras."""
-    moved_deg = float(np.rad2deg(angle_between(found.up, prior.up_in_world)))
-    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
-    # ramp.
-    if found and moved_deg > 2.0 + 3 * 1.4826 * prior.disagreement_deg:
-        return _unknown(f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction")
+def _near(found: Upward, prior: Vertical, source: str, *, evidence: str) -> Vertical:
+    """Return a direction as the vertical, unless it is too far from the prior one."""
     if not found:
         return _unknown(found.reason)
+    moved_deg = float(np.rad2deg(angle_between(found.up, prior.up_in_world)))
+    # Lines or surfaces farther than this (plus three deviations) from it are a slope or a ramp.
+    if moved_deg > 2.0 + 3 * 1.4826 * np.nan_to_num(prior.disagreement_deg):
+        return _unknown(f"{evidence} are tilted by {moved_deg:.1f}° against the {prior.source}")
     return Vertical(found.up, source, evidence, prior.disagreement_deg, uncertainty_deg=found.uncertainty_deg)
 
 
@@ -213,13 +217,6 @@ def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArra
         mean = directions[kept].mean(axis=0)
         mean = mean / np.linalg.norm(mean)
     return mean, np.rad2deg(angle_between(directions, mean)), kept
-
-
-def _of_one_camera(poses: Poses) -> Vertical:
-    if not poses.names:
-        return _unknown("there is no camera")
-    # How far from upright a single camera is usually held.
-    return Vertical(poses.rotations[0].T @ UP, "cameras", "a single camera", 2.0)
 
 
 def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) -> float:
@@ -259,10 +256,11 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Upwa
     # 200 to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
     if contrast < 1.3:
         return Upward(up, reason=f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
-    # The standard deviation of the mean of the directions of four parts of the points.
+    # The deviation of four parts of the points. That of their mean would be half of it, but they have furniture and
+    # slopes in common: in rendered houses with true points, errors are twice as large.
     parts = [most_supported(partial(_concentrations, near[part::4]), best, _ROUNDS[1:]) for part in range(4)]
     offs = [float(np.rad2deg(angle_between(found, best))) for found in parts]
-    return Upward(best, uncertainty_deg=float(np.hypot(np.sqrt(np.mean(np.square(offs)) / 4), _ROUNDS[-1][1])))
+    return Upward(best, uncertainty_deg=float(np.hypot(np.sqrt(np.mean(np.square(offs))), _ROUNDS[-1][1])))
 
 
 def _concentrations(points: FloatArray, candidates: FloatArray, width: float) -> FloatArray:
@@ -292,8 +290,8 @@ def level_poses(
         Evidence,
         Setting(
             "source of the vertical: sensors (pitch and roll in the metadata), lines (vertical edges in the pictures), "
-            "structure (level surfaces among the sparse points), or cameras (their up directions); auto uses the first "
-            "available one"
+            "structure (level surfaces among the sparse points), or cameras (their up directions); auto averages the "
+            "most precise one and those that agree with it"
         ),
     ] = "auto",
     max_uncertainty_deg: Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -48,7 +48,7 @@ def verify_poses(
             if it is doubted and below 1 / (1 + miss_cost).
 
     Returns:
-        The poses with `confirmed_shares`, `expected_shares`, `right_probabilities` and `doubts`. Points are
+        The poses with `confirmed_shares`, `expected_shares`, `evidence`, `right_probabilities` and `doubts`. Points are
         triangulated again if a camera was moved or left out.
     """
     if len(poses.names) < 2:
@@ -56,19 +56,10 @@ def verify_poses(
     groups = [
         verified_group(
             group, load, features=features or {}, two_views=two_views or {}, correct=correct, miss_cost=miss_cost
-        ).poses
+        )
         for group in split_groups(poses)
     ]
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
-
-
-@dataclass(frozen=True, eq=False)
-class VerifiedGroup:
-    """Checked poses of one group, and what they were checked with."""
-
-    poses: Poses  # the poses, with their doubts
-    model: PlacedModel  # the same cameras with their pairs
-    checks: CameraChecks  # the evidence of the images for each of them
 
 
 def verified_group(
@@ -79,7 +70,7 @@ def verified_group(
     two_views: Mapping[tuple[str, str], TwoView],
     correct: bool,
     miss_cost: float = MISS_COST,
-) -> VerifiedGroup:
+) -> Poses:
     """Check and correct poses of one group; the arguments are those of `verify_poses`."""
     known = all(name in features for name in poses.names)
     inside = {pair: view for pair, view in two_views.items() if known and {*pair} <= {*poses.names}}
@@ -91,7 +82,7 @@ def verified_group(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return VerifiedGroup(with_camera_checks(poses, pairs, checks), model, checks)
+    return with_camera_checks(poses, pairs, checks)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -116,7 +107,7 @@ def poses_of(model: PlacedModel) -> Poses:
 
 
 def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Poses:
-    """Return poses of one group with the evidence of the images."""
+    """Return poses of one group with the evidence for and against each camera."""
     position = {name: idx for idx, name in enumerate(pairs.names)}
 
     def of_each(values: Mapping[int, float]) -> np.ndarray:
@@ -126,6 +117,10 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
         poses,
         confirmed_shares=of_each(checks.shares) if checks.asked else None,
         expected_shares=of_each(checks.expected) if checks.asked else None,
+        evidence={
+            pairs.names[idx]: {key: float(value) if np.isfinite(value) else None for key, value in row.items()}
+            for idx, row in checks.evidence.items()
+        },
         right_probabilities=of_each(checks.p_right),
         doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )

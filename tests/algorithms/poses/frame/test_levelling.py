@@ -23,7 +23,7 @@ def test_levelling_undoes_any_tilt_and_changes_nothing_else(seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = room_poses(seed)
     tilted = moved_poses(poses, Similarity3(1.0, random_rotation(rng), rng.normal(size=3)))
-    level, vertical = level_poses(tilted, sensed(poses, rng, 0.0))
+    level, vertical = level_poses(tilted, sensed(poses, rng, 0.0), evidence="sensors")
     assert vertical.source == "sensors"
     np.testing.assert_allclose(
         np.einsum("nij,j->ni", level.rotations, UP), list(sensed(poses, rng, 0.0).values()), atol=1e-7
@@ -37,17 +37,16 @@ def test_levelling_undoes_any_tilt_and_changes_nothing_else(seed: int) -> None:
 
 def test_levelling_twice_is_levelling_once() -> None:
     readings = sensed(room_poses(1), np.random.default_rng(1), 0.3)
-    once, _ = level_poses(
-        moved_poses(room_poses(1), Similarity3(1.0, rotation_from_rotvec([0.2, 0.1, -0.3]), UP)), readings
-    )
-    twice, _ = level_poses(once, readings)
+    turned = moved_poses(room_poses(1), Similarity3(1.0, rotation_from_rotvec([0.2, 0.1, -0.3]), UP))
+    once, _ = level_poses(turned, readings, evidence="sensors")
+    twice, _ = level_poses(once, readings, evidence="sensors")
     np.testing.assert_allclose(twice.rotations, once.rotations, atol=1e-9)
     np.testing.assert_allclose(twice.translations, once.translations, atol=1e-9)
 
 
 def test_a_level_world_keeps_its_z_axis() -> None:
     poses = room_poses(2)
-    level, _ = level_poses(poses, sensed(poses, np.random.default_rng(0), 0.0))
+    level, _ = level_poses(poses, sensed(poses, np.random.default_rng(0), 0.0), evidence="sensors")
     np.testing.assert_allclose(level.rotations, poses.rotations, atol=1e-7)
 
 

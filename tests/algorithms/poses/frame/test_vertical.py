@@ -18,7 +18,6 @@ from pano_mvs.algorithms.poses.frame.vertical import (
     sharpest_up,
     vertical_from_cameras,
     vertical_from_sensors,
-    vertical_from_structure,
 )
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, rotation_from_rotvec
 from pano_mvs.scene import Poses
@@ -112,7 +111,7 @@ def test_level_surfaces_find_the_vertical_where_cameras_are_tilted(seed: int) ->
     poses = room_poses(seed)
     turn = random_rotation(np.random.default_rng(seed))
     moved = moved_poses(poses, Similarity3(0.3, turn, np.ones(3)))
-    from_cameras, from_structure = vertical_from_cameras(moved), vertical_from_structure(moved)
+    from_cameras, from_structure = vertical_from_cameras(moved), find_vertical(moved, evidence="structure")
     assert from_cameras.disagreement_deg > 1
     assert angle_deg(from_structure.up_in_world, turn @ UP) < 0.35
     assert find_vertical(moved).source == "structure"
@@ -123,11 +122,12 @@ def test_without_level_surfaces_the_cameras_decide() -> None:
     poses = room_poses(1, cameras=6)
     ball = rng.normal(size=(1000, 3))
     formless = with_points([poses.cam_from_world(idx) for idx in range(6)], ball)
-    assert "no clear level surfaces" in vertical_from_structure(formless).reason
+    assert "no clear level surfaces" in find_vertical(formless, evidence="structure").reason
     vertical = find_vertical(formless)
     assert vertical.source == "cameras"
     assert angle_deg(vertical.up_in_world, UP) < 6
-    assert "100 are needed" in vertical_from_structure(with_points([Rigid3.identity()] * 2, np.ones((3, 3)))).reason
+    few = with_points([Rigid3.identity()] * 2, np.ones((3, 3)))
+    assert "100 are needed" in find_vertical(few, evidence="structure").reason
 
 
 def test_a_slope_is_not_taken_for_a_level_floor() -> None:
@@ -135,8 +135,27 @@ def test_a_slope_is_not_taken_for_a_level_floor() -> None:
     poses = room_poses(2, cameras=6, tilt_deg=0.5)
     ramp = rotation_from_rotvec([np.deg2rad(12.0), 0, 0])
     tilted = replace(poses, points_in_world=poses.points_in_world @ ramp.T)
-    assert "are tilted by" in vertical_from_structure(tilted).reason
+    assert "are tilted by" in find_vertical(tilted, evidence="structure").reason
     assert angle_deg(find_vertical(tilted).up_in_world, UP) < 1
+
+
+def test_sources_that_agree_are_averaged_by_precision() -> None:
+    poses = room_poses(4, cameras=8)
+    alone = {"structure": find_vertical(poses, evidence="structure"), "cameras": vertical_from_cameras(poses)}
+    mean = find_vertical(poses)
+    precisions = {each: vertical.uncertainty_deg**-2 for each, vertical in alone.items()}
+    assert mean.weights == pytest.approx({each: one / sum(precisions.values()) for each, one in precisions.items()})
+    assert mean.uncertainty_deg == pytest.approx(sum(precisions.values()) ** -0.5)
+    assert angle_deg(mean.up_in_world, UP) < mean.uncertainty_deg
+
+
+def test_a_source_that_disagrees_with_the_most_precise_one_has_no_weight() -> None:
+    poses = room_poses(2, cameras=6, tilt_deg=0.5)
+    ramp = rotation_from_rotvec([np.deg2rad(2.2), 0, 0])
+    tilted = replace(poses, points_in_world=poses.points_in_world @ ramp.T)
+    vertical = find_vertical(tilted)
+    assert vertical.weights == {"structure": 1.0}
+    assert vertical.uncertainty_deg == find_vertical(tilted, evidence="structure").uncertainty_deg
 
 
 def test_cameras_held_at_random_tell_nothing() -> None:
@@ -270,3 +289,6 @@ def test_sensors_are_believed_against_the_pictures() -> None:
     pictures = {name: lambda: (np.ascontiguousarray(picture[::-1, ::-1]), valid) for name in poses.names}
     sensors = dict.fromkeys(poses.names, tuple(UP))
     assert angle_deg(find_vertical(poses, sensors, pictures).up_in_world, UP) < 1
+    vertical = find_vertical(turned_over(poses), dict.fromkeys(poses.names, tuple(-UP)), pictures)
+    assert vertical.weights.keys() == {"sensors", "structure"}
+    assert angle_deg(vertical.up_in_world, UP) < 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.vertical import level_poses, vertical_from_lines
+from pano_mvs.algorithms.poses.frame.vertical import find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, Segments, find_segments, up_from_lines
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import Poses
@@ -46,7 +46,7 @@ def capture(count: int = 2, *, tilt_deg: float = 4.0, seed: int = 0) -> tuple[Po
 @pytest.mark.parametrize("seed", range(3))
 def test_stripes_point_up_whatever_the_tilt_of_the_cameras(seed: int) -> None:
     poses, pictures = capture(seed=seed)
-    vertical = vertical_from_lines(poses, pictures)
+    vertical = find_vertical(poses, pictures=pictures, evidence="lines")
     assert vertical
     assert angle_deg(vertical.up_in_world, UP) < 0.15
     assert 0.1 <= vertical.uncertainty_deg < 0.3
@@ -76,7 +76,8 @@ def test_blobs_have_no_vertical() -> None:
     grey = cv2.GaussianBlur(rng.uniform(0, 255, SIZE_HW).astype(np.float32), (0, 0), 4)
     grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     poses, _ = capture(1)
-    vertical = vertical_from_lines(poses, {"0": lambda: (np.repeat(grey[..., None], 3, -1), np.ones(SIZE_HW, bool))})
+    blobs: dict[str, Picture] = {"0": lambda: (np.repeat(grey[..., None], 3, -1), np.ones(SIZE_HW, bool))}
+    vertical = find_vertical(poses, pictures=blobs, evidence="lines")
     assert not vertical
     assert "too few" in vertical.reason or "no clear vertical lines" in vertical.reason
 
