@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,6 +31,7 @@ class Call:
     refusal: PanoMvsError | None = None  # the error by which the stage rejected its inputs
     # (H, W) valid pixels of a returned panorama, whose files no longer exist after the call
     mask: NDArray[np.bool_] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +66,17 @@ class StageCase:
             for port in self.spec.ports
         }
 
-    def call(self, capture: TinyCapture, *, threads: int = 1, arguments: Mapping[str, Any] | None = None) -> Call:
+    def call(
+        self,
+        capture: TinyCapture,
+        *,
+        threads: int = 1,
+        arguments: Mapping[str, Any] | None = None,
+        see: Callable[[Any], None] | None = None,
+    ) -> Call:
         """Call the stage on the first image, the first pair, or all, with fixed random numbers.
 
+        `see` is called with the result while its files exist.
         Our own errors, except those that blame the stage, count as rejected inputs; all other exceptions are raised.
         """
         with TemporaryDirectory(prefix="pano-mvs-call-") as scratch:
@@ -85,10 +94,13 @@ class StageCase:
             except PanoMvsError as error:
                 return Call(None, f"{type(error).__name__}: {error}", error)
             require_valid(value, self.spec, Path(scratch))
+            if see is not None:
+                see(value)
             figures = {name: float(metric).hex() for name, metric in context.metrics.items()}
             told = [figures, context.notes, context.rejected]
+            digest = digest_from_value([digest_of(value), json.dumps(told)])
             mask = value.load_mask() if isinstance(value, Panorama) else None
-            return Call(value, digest_from_value([digest_of(value), json.dumps(told)]), mask=mask)
+            return Call(value, digest, mask=mask, notes=(*context.notes,))
 
     def _argument(self, port: Port, capture: TinyCapture) -> Any:
         items = capture.items.get(port.kind)
