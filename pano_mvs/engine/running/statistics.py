@@ -14,15 +14,14 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import (
-    Failure,
     Observer,
     RunResult,
     StageStarted,
     StageSummary,
+    UnitFailed,
     UnitFinished,
     UnitStarted,
     UnitStatus,
-    consequence_of,
 )
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
@@ -86,11 +85,11 @@ class RunStatistics:
         summary = self._counts[entry.name].summary
         if entry.spec.list_items is not None:
             summary.failed += 1
-            failure = Failure(entry.name, item, reason, consequence="the run goes on without this image")
+            consequence = "the run goes on without this image"
+            self._result.failures.append(UnitFailed(entry.name, item, reason, consequence))
         else:
             summary.blocked += 1
-            failure = Failure(entry.name, item, f"it {reason}", consequence=consequence_of(entry, item), blocked=True)
-        self._result.failures.append(failure)
+            self._result.blocked.append(UnitFailed(entry.name, item, f"it {reason}"))
         self._observer(UnitFinished(entry.name, item, "blocked", 0.0))
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
@@ -125,13 +124,13 @@ class RunStatistics:
         seconds = round(record.seconds, 6) if status == "run" else 0.0
         self._observer(UnitFinished(entry.name, item, status, seconds))
 
-    def unit_failed(self, failure: Failure, seconds: float) -> None:
+    def unit_failed(self, failure: UnitFailed, seconds: float) -> None:
         """Count a unit without a result."""
         count = self._counts[failure.stage]
         self._stop_clock(count, failure.item)
         count.summary.failed += 1
         self._result.failures.append(failure)
-        self._observer(failure.event())
+        self._observer(failure)
         self._observer(UnitFinished(failure.stage, failure.item, "failed", round(seconds, 6)))
 
     def stage_complete(self, entry: StageEntry) -> None:
@@ -198,15 +197,16 @@ class RunStatistics:
             replaced: stages whose results later stages replaced: their doubts do not count any more.
         """
         result = self._result
-        result.stages.sort(key=lambda summary: position_of(summary.name, ""))
-        result.failures.sort(key=lambda failure: position_of(failure.stage, failure.item))
+        result.stages.sort(key=lambda summary: position_of(summary.stage, ""))
+        for units in (result.failures, result.blocked):
+            units.sort(key=lambda unit: position_of(unit.stage, unit.item))
 
         def enter(stage: str, found: Mapping[str, Mapping[str, str]], reasons: dict[str, tuple[str, str]]) -> None:
             for item in sorted(found, key=lambda item: position_of(stage, item)):
                 for image, reason in found[item].items():
                     reasons.setdefault(image, (stage, reason))
 
-        for name in (summary.name for summary in result.stages):
+        for name in (summary.stage for summary in result.stages):
             enter(name, self._counts[name].rejected, result.rejected)
             enter(name, {} if name in replaced else self._counts[name].doubts, result.doubts)
 
