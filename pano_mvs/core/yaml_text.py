@@ -155,7 +155,7 @@ def report_invalid(
 
 
 def _keys_at(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
-    """Return the keys of the settings at a path below a model; steps that are no fields are keys of a mapping."""
+    """Return the keys of the settings at a path below a model; other steps are keys of mappings."""
     for step in path:
         fields = {info.alias or name: info for name, info in model.model_fields.items()}
         if step in fields:
