@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import ClassVar, Literal, get_args
 
-from pano_mvs.engine.workflows.workflow import StageEntry
-
 UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
@@ -23,12 +21,6 @@ class UnitFailed:
     log: str = ""  # file with what the unit printed; empty if it printed nothing
     said: tuple[str, ...] = ()  # the last lines that it printed
     trace: str = ""  # the Python traceback, if the code of the stage failed
-
-
-def consequence_of(entry: StageEntry, item: str) -> str:
-    """Return what is missing in the results without a unit."""
-    kind = entry.spec.output.kind_name()
-    return f"there is no {kind} for {item}" if item else f"there is no {kind}"
 
 
 @dataclass(slots=True)

@@ -35,7 +35,7 @@ from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
-from pano_mvs.engine.running.events import Observer, RunResult, UnitFailed, Warned, consequence_of, ignore
+from pano_mvs.engine.running.events import Observer, RunResult, UnitFailed, Warned, ignore
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
@@ -397,7 +397,7 @@ class RunPass:
             entry.name,
             unit.item,
             outcome.cause,
-            consequence_of(entry, unit.item),
+            f"there is no {entry.spec.output.kind_name()}{f' for {unit.item}' if unit.item else ''}",
             "" if finished.log is None else str(finished.log),
             finished.said,
             outcome.trace,

@@ -305,7 +305,7 @@ def test_a_run_is_shown_as_in_its_own_terminal_with_workers_disk_and_range(
 @pytest.mark.parametrize(
     ("end", "said"),
     [
-        (RunFinished(0, "", seconds=90.0), "finished (exit code 0) after 2 min"),
+        (RunFinished(0, "", seconds=90.0), "finished (exit code 0) after 90 s"),
         (RunFinished(4, "the disk is full", seconds=5.0), "check (exit code 4) after 5 s: the disk is full"),
         (RunFinished(130, "interrupted", seconds=5.0), "interrupted (exit code 130) after 5 s"),
     ],
