@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,21 +18,21 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from pano_mvs.core.digest import digest_from_file
+from pano_mvs.core.paths import below, children, stat_of
 from pano_mvs.engine.stages.stage import Cardinality, Names, StageSpec
 from pano_mvs.scene import Files, PointCloud, Poses
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
 from pano_mvs.scene.surfaces import Structure, TrackedPoints
-from pano_mvs.testing.stage_calls import StageCase
+from pano_mvs.testing.stage_calls import Call, StageCase
 
 
 def exporter_tests(spec: StageSpec) -> dict[str, Callable[[StageCase], None]]:
     """Return the contract tests of a stage that returns files, by name; none for other stages."""
-    if not issubclass(spec.output, Files):
-        return {}
-    tests: dict[str, Callable[[StageCase], None]] = {"writes to its scratch folder only": _writes_to_scratch}
-    if any(port.cardinality is Cardinality.EACH for port in spec.ports):
+    tests: dict[str, Callable[[StageCase], None]] = {}
+    if issubclass(spec.output, Files):
+        tests["writes to its scratch folder only"] = _writes_to_scratch
+    if not tests or any(port.cardinality is Cardinality.EACH for port in spec.ports):
         return tests
     tests["accepts images of any name"] = _accepts_any_name
     if any(port.kind in (Poses, PointCloud) for port in spec.ports):
@@ -45,7 +46,7 @@ def exporter_tests(spec: StageSpec) -> dict[str, Callable[[StageCase], None]]:
 _OF_ONE_GROUP = (Photographs, Structure, TrackedPoints)
 # Characters with a meaning in XML, HTML, JSON, URLs or shells; blanks; a letter outside ASCII; a folder.
 _ODD_NAME = 'ä b/#{} "x" & <i>$0%20.png'
-_PARSERS: Mapping[str, Callable[[str], object]] = {
+_PARSERS: Mapping[str, Callable[[bytes], object]] = {
     ".json": json.loads,
     ".xml": ElementTree.fromstring,
     ".svg": ElementTree.fromstring,
@@ -56,22 +57,25 @@ _TEXTS = (*_PARSERS, ".cfg", ".html", ".js", ".mtl", ".obj")
 
 def _writes_to_scratch(case: StageCase) -> None:
     """The stage changes nothing beside its inputs or in the current folder."""
-    capture = case.capture.folder
-    before = {path: path.stat().st_mtime_ns for path in capture.rglob("*")}
+
+    def times() -> dict[Path, int]:
+        return {path: found.st_mtime_ns for path in below(case.capture.folder) if (found := stat_of(path))}
+
+    before = times()
     with TemporaryDirectory() as current, chdir(current):
         case.call(case.capture)
-        left = [path.name for path in Path(current).iterdir()]
-    changed = [str(path) for path in capture.rglob("*") if path.stat().st_mtime_ns != before.get(path)]
-    assert not left + changed, f"{case.spec.name} writes {', '.join(left + changed)}, outside ctx.scratch"
+        changed = children(Path(current))
+    changed += [path for path, at in times().items() if at != before.get(path)]
+    assert not changed, f"{case.spec.name} writes {', '.join(map(str, changed))}, outside ctx.scratch"
 
 
 def _accepts_any_name(case: StageCase) -> None:
     """The stage writes as many files whatever images are called, and others can parse them."""
-    renamed = {name: _ODD_NAME.format(idx) for idx, name in enumerate(case.capture.names)}
-    given = case.arguments(case.capture)
-    plain, _ = _written(case, given)
-    odd, _ = _written(case, {port: _renamed(value, renamed) for port, value in given.items()})
+    names = {name: _ODD_NAME.format(idx) for idx, name in enumerate(case.capture.names)}
+    plain, odd = _call(case, lambda value: value).files, _call(case, partial(_renamed, names)).files
     assert len(odd) == len(plain), f"{case.spec.name} writes {len(odd)} files, not {len(plain)}, if names are odd"
+    for target, content in odd.items():
+        _PARSERS.get(PurePosixPath(target).suffix, len)(content)
 
 
 def _states_frame(case: StageCase) -> None:
@@ -84,82 +88,54 @@ def _states_frame(case: StageCase) -> None:
 
 def _leaves_out_unregistered(case: StageCase) -> None:
     """The files do not depend on images without a pose."""
-    given, names = case.arguments(case.capture), case.capture.names[:-1]
-    with_others, _ = _written(
-        case,
-        {
-            port: _of_images(value, names) if isinstance(value, Poses | TrackedPoints) else value
-            for port, value in given.items()
-        },
-    )
-    alone, _ = _written(case, {port: _of_images(value, names) for port, value in given.items()})
-    assert with_others == alone, f"{case.spec.name} depends on images without a pose"
+    registered = partial(_of_images, case.capture.names[:-1])
+    beside = _call(case, lambda value: registered(value) if isinstance(value, Poses) else value)
+    assert beside.files == _call(case, registered).files, f"{case.spec.name} depends on images without a pose"
 
 
 def _keeps_groups_apart(case: StageCase) -> None:
     """Each group of poses has the same files as when it is alone, unless a note says why not; texts may be of all."""
-    given = {
-        port: None if isinstance(value, _OF_ONE_GROUP) else value
-        for port, value in case.arguments(case.capture).items()
-    }
-    names = case.capture.names
-    halves = [{port: _of_images(value, part) for port, value in given.items()} for part in (names[:2], names[2:])]
-    joined, notes = _written(case, {port: _joined([half[port] for half in halves], given[port]) for port in given})
-    first, second = (_binary(_written(case, half)[0]) for half in halves)
-    lost = [target for target, digest in first.items() if joined.get(target) != digest]
+    halves = [partial(_of_images, part) for part in (case.capture.names[:2], case.capture.names[2:])]
+
+    def joined(value: Any) -> Any:
+        if isinstance(value, Poses):
+            return join_groups([half(value) for half in halves])
+        return PointCloud.of_groups([value, value]) if isinstance(value, PointCloud) else value
+
+    first, second, both = (
+        _call(case, lambda value, change=change: None if isinstance(value, _OF_ONE_GROUP) else change(value))  # type: ignore[misc]
+        for change in (*halves, joined)
+    )
+    one, other, found = (
+        {target: data for target, data in call.files.items() if PurePosixPath(target).suffix not in _TEXTS}
+        for call in (first, second, both)
+    )
+    lost = [target for target, data in one.items() if found.get(target) != data]
     assert not lost, f"{case.spec.name}: a second group of poses changes {', '.join(lost)} of the first"
-    missing = Counter(second.values()) - (Counter(_binary(joined).values()) - Counter(first.values()))
-    assert not missing or any("group 1" in note for note in notes), (
+    missing = Counter(other.values()) - (Counter(found.values()) - Counter(one.values()))
+    assert not missing or any("group 1" in note for note in both.notes), (
         f"{case.spec.name} does not write {missing.total()} files of the second group of poses, and has no note"
     )
 
 
-def _binary(digests: Mapping[str, str]) -> dict[str, str]:
-    return {target: digest for target, digest in digests.items() if PurePosixPath(target).suffix not in _TEXTS}
+def _call(case: StageCase, change: Callable[[Any], Any]) -> Call:
+    """Call the stage with each input changed."""
+    given = case.arguments(case.capture)
+    return case.call(case.capture, arguments={port: change(value) for port, value in given.items()})
 
 
-def _written(case: StageCase, arguments: Mapping[str, Any]) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Call the stage; return the digest of each file by target, and the notes. Documents that can be parsed are."""
-    digests: dict[str, str] = {}
-
-    def see(value: Files) -> None:
-        for target, path in value.files.items():
-            digests[target] = digest_from_file(path)
-            if (parser := _PARSERS.get(PurePosixPath(target).suffix)) is not None:
-                parser(path.read_text(encoding="utf-8"))
-
-    call = case.call(case.capture, arguments=arguments, see=see)
-    return digests, call.notes
-
-
-def _of_images(value: Any, names: Sequence[str]) -> Any:
+def _of_images(names: Sequence[str], value: Any) -> Any:
     """Return an input as if the capture had only some of its images."""
     if isinstance(value, Poses):
         return with_cameras(value, np.isin(value.names, names))
-    if isinstance(value, TrackedPoints):
-        kept = np.isin(value.names, names)
-        seen = kept[value.track_image_idx]
-        return replace(
-            value,
-            names=tuple(names),
-            track_point_idx=value.track_point_idx[seen],
-            track_image_idx=(np.cumsum(kept, dtype=np.int32) - 1)[value.track_image_idx[seen]],
-            track_bearings=value.track_bearings[seen],
-        )
     if isinstance(value, Names):
         return Names(names)
     return {name: value[name] for name in names} if isinstance(value, Mapping) else value
 
 
-def _joined(halves: Sequence[Any], whole: Any) -> Any:
-    if isinstance(whole, Poses):
-        return join_groups(halves)
-    return PointCloud.of_groups(halves) if isinstance(whole, PointCloud) else whole
-
-
-def _renamed(value: Any, renamed: Mapping[str, str]) -> Any:
+def _renamed(names: Mapping[str, str], value: Any) -> Any:
     if isinstance(value, Poses | TrackedPoints):
-        return replace(value, names=tuple(renamed[name] for name in value.names))
+        return replace(value, names=tuple(names[name] for name in value.names))
     if isinstance(value, Names):
-        return Names(renamed[name] for name in value)
-    return {renamed[name]: item for name, item in value.items()} if isinstance(value, Mapping) else value
+        return Names(names.values())
+    return {names[name]: item for name, item in value.items()} if isinstance(value, Mapping) else value

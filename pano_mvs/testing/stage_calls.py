@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,6 +32,7 @@ class Call:
     # (H, W) valid pixels of a returned panorama, whose files no longer exist after the call
     mask: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict)  # target to the content of a returned file
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +67,9 @@ class StageCase:
             for port in self.spec.ports
         }
 
-    def call(
-        self,
-        capture: TinyCapture,
-        *,
-        threads: int = 1,
-        arguments: Mapping[str, Any] | None = None,
-        see: Callable[[Any], None] | None = None,
-    ) -> Call:
+    def call(self, capture: TinyCapture, *, threads: int = 1, arguments: Mapping[str, Any] | None = None) -> Call:
         """Call the stage on the first image, the first pair, or all, with fixed random numbers.
 
-        `see` is called with the result while its files exist.
         Our own errors, except those that blame the stage, count as rejected inputs; all other exceptions are raised.
         """
         with TemporaryDirectory(prefix="pano-mvs-call-") as scratch:
@@ -94,13 +87,13 @@ class StageCase:
             except PanoMvsError as error:
                 return Call(None, f"{type(error).__name__}: {error}", error)
             require_valid(value, self.spec, Path(scratch))
-            if see is not None:
-                see(value)
             figures = {name: float(metric).hex() for name, metric in context.metrics.items()}
             told = [figures, context.notes, context.rejected]
             digest = digest_from_value([digest_of(value), json.dumps(told)])
             mask = value.load_mask() if isinstance(value, Panorama) else None
-            return Call(value, digest, mask=mask, notes=(*context.notes,))
+            written = value.files if isinstance(value, Files) else {}
+            files = {target: path.read_bytes() for target, path in written.items()}
+            return Call(value, digest, mask=mask, notes=(*context.notes,), files=files)
 
     def _argument(self, port: Port, capture: TinyCapture) -> Any:
         items = capture.items.get(port.kind)
