@@ -92,7 +92,7 @@ def test_all_executors_give_the_same_bytes(rendered: Path, tmp_path: Path) -> No
             sys.executable,
             *f"-m pano_mvs run quickstart --images {rendered}".split(),
             *SMALL,
-            *"--set depth.planes=16 --set views.sources=2".split(),
+            *["--set", "depth.planes=16", "--set", "views.sources=2"],
             *options,
             *f"--out {tmp_path / f'out-{name}'} --cache {tmp_path / f'cache-{name}'}".split(),
         ]
