@@ -50,6 +50,10 @@ class StageSummary(StageFinished):
     stored_bytes: int = 0  # bytes of the results that its computed units stored in the cache
     unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)  # unit to its own metrics
     notes: list[str] = field(default_factory=list)
+    # unit to its own notes, and to the images that it rejects or doubts, with the reasons
+    unit_notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rejected: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    doubts: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def typical_unit_s(self) -> float:

@@ -15,7 +15,7 @@ import pytest
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_scores, print_summary
-from pano_mvs.cli.run.progress import ProgressDisplay, _Repeated
+from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.watch_command import WatchDisplay, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
@@ -176,19 +176,12 @@ def test_drawing_ends_with_the_run(is_terminal: bool) -> None:
     assert (size > 0) == is_terminal
 
 
-def test_lines_are_repeated_by_a_thread_until_the_run_ends() -> None:
-    calls: list[int] = []
-    ended = threading.Event()
-
-    def call() -> None:
-        calls.append(1)
-        if len(calls) == 3:
-            ended.set()
-
-    with _Repeated(call, first_s=0.0, every_s=0.0):
-        assert ended.wait(60)
-    count = len(calls)
-    assert count >= 3
+def test_lines_are_repeated_by_a_thread_until_the_run_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, calls = Shown(is_terminal=False), threading.Semaphore(0)
+    monkeypatch.setattr(shown.display, "print_line", calls.release)
+    monkeypatch.setattr("threading.Event.wait", lambda ended, timeout=None: ended.is_set())
+    with shown.display:
+        assert all(calls.acquire(timeout=60) for _ in range(3))
 
 
 def test_lines_do_not_end_up_in_what_a_unit_printed(tmp_path: Path) -> None:
