@@ -22,8 +22,9 @@ def test_no_library_is_imported_before_it_is_needed(module: str) -> None:
     assert done.stdout.split() == []
 
 
-def test_a_plugin_does_not_wait_for_the_libraries_of_solvers() -> None:
-    code = "import sys, pano_mvs.api; print(*({'numba', 'pycolmap', 'pyvista', 'scipy'} & set(sys.modules)))"
+@pytest.mark.parametrize("module", ["pano_mvs.api", "pano_mvs.cli.watch_command"])
+def test_nobody_waits_for_the_libraries_of_solvers(module: str) -> None:
+    code = f"import sys, {module}; print(*({{'numba', 'pycolmap', 'pyvista', 'scipy'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 

@@ -98,3 +98,17 @@ def path(given: str) -> Path:
     if "\0" in str(given):
         raise typer.BadParameter("a path cannot hold a null byte")
     return Path(text(given))
+
+
+_ENDINGS = {
+    0: "finished",
+    2: "not possible: there is a mistake in the command, the workflow or the input",
+    3: "finished, but some items failed or were left out, or some cameras are doubtful",
+    4: "stopped by a quality threshold or a safety check",
+    130: "interrupted",
+}
+
+
+def ending_text(exit_code: int) -> str:
+    """Return how a run ended, by its exit code."""
+    return _ENDINGS.get(exit_code, "ended by an internal error")

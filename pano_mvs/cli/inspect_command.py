@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from pano_mvs.engine.planning.units import Unit
 from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.evaluation.tables import finite_or_none
 from pano_mvs.io.images.names import match_image_names
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
 from pano_mvs.session.session import Session, run_command
@@ -88,7 +90,10 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     sweep = wanted.stage or sweeps[0]
     store = Store(session.store_root, for_reading=True)
     found = _Found()
-    plans = make_plan(session.workflow, session.graph, store, visit=found.look)
+    failed: set[tuple[str, str]] = set()
+    with suppress(InputError):  # there may be no run
+        failed = {(unit.stage, unit.item) for unit in RunSummary.read(session.out).failures}
+    plans = make_plan(session.workflow, session.graph, store, visit=found.look, failed=failed)
     image = _image(wanted.image, found.images)
     unit = found.units.get(sweep, {}).get(image)
     if unit is None:

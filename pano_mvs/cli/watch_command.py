@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.run.command import ending_text
+from pano_mvs.cli.endings import ending_text
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.memory import size_text

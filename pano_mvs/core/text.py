@@ -47,12 +47,12 @@ def shortened_list(names: Iterable[str], count: int = 3, *, rest: str = " … ({
 def duration_text(seconds: float) -> str:
     """Return a duration as text, rounded.
 
-    >>> [duration_text(seconds) for seconds in (0.4, 5, 89, 600, 9000)]
-    ['0.4 s', '5 s', '89 s', '10 min', '2.5 h']
+    >>> [duration_text(seconds) for seconds in (0.4, 5, 119, 600, 9000)]
+    ['0.4 s', '5 s', '119 s', '10 min', '2.5 h']
     """
     if seconds < 0.95:
         return f"{seconds:.1f} s"
-    if seconds < 90:
+    if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -122,11 +122,18 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
 
 
 def report_invalid(
-    error: ValidationError, node: Located, problems: Problems, *, known: Sequence[str], subject: str = ""
+    error: ValidationError,
+    node: Located,
+    problems: Problems,
+    *,
+    model: type[BaseModel],
+    also: Sequence[str] = (),
+    subject: str = "",
 ) -> None:
     """Add a line for each setting that does not fit a model.
 
     Args:
+        also: further keys that are allowed beside the fields of the model.
         subject: what the settings belong to, at the beginning of each line.
     """
     for problem in error.errors(include_url=False):
@@ -134,7 +141,7 @@ def report_invalid(
         found = node.at(path)
         key = ".".join(map(str, path))
         if problem["type"] == "extra_forbidden":
-            hint = did_you_mean(key, list(dict.fromkeys(known)) if len(path) == 1 else [])
+            hint = did_you_mean(str(path[-1]), [*_keys_at(model, path[:-1]), *(also if len(path) == 1 else ())])
             problems.add(found.key_place, f"{subject}unknown setting {key[:80]!r}.{hint}")
         elif problem["type"] == "missing":
             problems.add(found.key_place, f"{subject}setting {key!r} is missing")
@@ -145,6 +152,22 @@ def report_invalid(
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
             setting = f"{key}: " if key else ""
             problems.add(found.place, f"{subject}{setting}{message} (got {shown})")
+
+
+def _keys_at(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
+    """Return the keys of the settings at a path below a model; other steps are keys of mappings."""
+    for step in path:
+        fields = {info.alias or name: info for name, info in model.model_fields.items()}
+        if step in fields:
+            model = next(_models_in(fields[step].annotation), model)
+    return [info.alias or name for name, info in model.model_fields.items()]
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
 
 
 def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:
@@ -229,6 +252,7 @@ class _Builder:
 
     def _mapping(self, node: MappingNode, depth: int) -> dict[str, Located]:
         entries: dict[str, Located] = {}
+        merged: list[Node] = []
         for key_node, value_node in node.value:
             line, column = key_node.start_mark.line + 1, key_node.start_mark.column + 1
             if not isinstance(key_node, ScalarNode):
@@ -239,6 +263,8 @@ class _Builder:
                 self._problem(key_node, f"tag {_shown(key_node.tag)} is not allowed; write a plain key")
             elif not is_printable(key):
                 self._problem(key_node, f"key {key[:_SHOWN_CHARACTERS]!r} contains control characters")
+            elif str(key_node.tag) == f"{_CORE}merge":
+                merged.append(value_node)
             elif key in entries:
                 self._problem(
                     key_node, f"key {key[:_SHOWN_CHARACTERS]!r} occurs twice (first in line {entries[key].key_line})"
@@ -246,6 +272,13 @@ class _Builder:
             else:
                 value = self.build(value_node, depth + 1)
                 entries[key] = Located(value.value, value.line, value.column, line, column, file=self.name)
+        for value_node in merged:
+            parts = value_node.value if isinstance(value_node, SequenceNode) else [value_node]
+            for part in parts:
+                if isinstance(part, MappingNode):
+                    entries = self.build(part, depth + 1).value | entries
+                else:
+                    self._problem(part, "a merge key (<<) takes a mapping or a list of mappings")
         return entries
 
     def _require_tag(self, node: Node, tag: str) -> None:

@@ -161,7 +161,7 @@ def _parsed(file: FilePart) -> _Calibration:
         try:
             return _Calibration.model_validate(root.plain())
         except ValidationError as error:
-            report_invalid(error, root, problems, known=list(_Calibration.model_fields))
+            report_invalid(error, root, problems, model=_Calibration)
             problems.raise_if_any()
             raise
     except WorkflowError as error:

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import duration_text, plural
 from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
@@ -83,7 +83,7 @@ def _environment() -> Environment:
     environment.filters |= {
         "share": figures.share,
         "probability_color": probability_color,
-        "duration": figures.duration,
+        "duration": duration_text,
         "figure": figures.figure,
         "short": figures.short,
         "words": figures.words,

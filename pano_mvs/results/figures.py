@@ -42,20 +42,6 @@ def share(value: Any) -> str:
     return f"{min(percent, 99.9) if percent < 100 else percent:.{digits}f} %"
 
 
-def duration(seconds: Any) -> str:
-    """Return seconds as `0.4 s`, `12 s`, `3 min 05 s` or `2 h 07 min`."""
-    if not _is_number(seconds):
-        return "–"
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-
-
 def degrees(value: Any) -> str:
     """Return an angle in degrees with two significant digits."""
     return f"{significant(value)}°" if _is_number(value) else "–"
@@ -107,14 +93,14 @@ def words(name: str) -> str:
     return f"{' '.join(parts)}, {_UNITS[last]}" if parts and last in _UNITS else name.replace("_", " ")
 
 
-def score_tables(scores: ScoresSummary) -> dict[str, Any]:
+def score_tables(scores: ScoresSummary, *, only: Sequence[str] = ()) -> dict[str, Any]:
     """Return the scores of the poses as rows, and those of the views as a table with one column per metric.
 
-    The score of a constant range map (`best_constant_…`) is added in brackets.
+    The score of a constant range map (`best_constant_…`) is added in brackets. `only`: the metrics; empty for all.
     """
     views = scores.views
     known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
-    columns = [metric for metric in _FIRST if metric in known] + [metric for metric in known if metric not in _FIRST]
+    columns = list(only or sorted(known, key=lambda metric: _FIRST.index(metric) if metric in _FIRST else len(_FIRST)))
     middle = {metric: median([view.get(metric) for view in views.values()]) for metric in _metrics(views)}
     return {
         "poses": list(scores.poses.items()),

@@ -14,13 +14,14 @@ import pano_mvs
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import file_inside, item_problem
 from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.core.text import duration_text
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_groups
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
-from pano_mvs.results.figures import duration, figure
+from pano_mvs.results.figures import figure
 from pano_mvs.results.pictures import Picture, evenly_spaced, picture
 from pano_mvs.results.records import Verdict, ViewSummary
 from pano_mvs.results.stored_values import StoredValues
@@ -123,7 +124,7 @@ class RunOutput:
         rows = "".join(
             f"<tr><td>{escape(stage.name)}</td><td>{escape(stage.use)}</td>"
             + "".join(f"<td>{figure(getattr(stage, name))}</td>" for name in names)
-            + f"<td>{duration(stage.seconds)}</td></tr>"
+            + f"<td>{duration_text(stage.seconds)}</td></tr>"
             for stage in self.summary.stages
         )
         parts = [

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from pano_mvs.algorithms.filters.consistency import Agreement, view_doubts
 from pano_mvs.core.errors import InputError, PanoMvsError, UsageError
@@ -127,7 +128,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
                 observer(forecast)
             summary, values = _execute(run, started, clock)
         end = replace(
-            _counted(run, end),
+            end,
             exit_code=summary.exit_code,
             stopped=summary.stopped,
             verdict=summary.verdict,
@@ -135,13 +136,16 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         )
         return RunOutput(session.out, summary, values, written=tuple(run.result.written))
     except PanoMvsError as error:
-        end = replace(_counted(run, end), exit_code=error.exit_code, stopped=str(error))
+        end = replace(end, exit_code=error.exit_code, stopped=str(error))
         raise
     except KeyboardInterrupt:
-        end = replace(_counted(run, end), exit_code=INTERRUPTED, stopped="interrupted")
+        end = replace(end, exit_code=INTERRUPTED, stopped="interrupted")
         raise
     finally:
-        report(replace(end, seconds=round(time.perf_counter() - clock, 3)))
+        units: dict[str, Any] = {}
+        if run is not None:
+            units |= run.result.units
+        report(replace(end, **units, seconds=round(time.perf_counter() - clock, 3)))
 
 
 def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:
@@ -164,13 +168,6 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
             if repairs > 3:  # more damage than this suggests a failing disk
                 raise
             run.observer(Warned(str(error)))
-
-
-def _counted(run: Run | None, end: RunFinished) -> RunFinished:
-    """Return the event with the units of a run."""
-    stages = run.result.stages if run is not None else []
-    names = ("run", "cached", "failed", "blocked")
-    return replace(end, **{name: sum(getattr(stage, name) for stage in stages) for name in names})
 
 
 def earlier_files(out: Path) -> dict[str, str]:
@@ -217,7 +214,8 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
 
 def write_outputs_after_error(run: Run, error: BaseException, *, started: datetime, clock: float) -> None:
     """Write run.json and the report of a run that raised an error; if it did nothing, the earlier ones stay."""
-    if not any(stage.run + stage.cached + stage.failed for stage in run.result.stages):
+    units = run.result.units
+    if not units["run"] + units["cached"] + units["failed"]:
         return
     interrupted = isinstance(error, KeyboardInterrupt)
     stopped = f"sys.exit({error.code})" if isinstance(error, SystemExit) else str(error)
@@ -234,7 +232,7 @@ _FIGURES = tuple(Agreement.__dataclass_fields__)
 
 def _compared_stage(run: Run) -> tuple[str, Mapping[str, Agreement]] | None:
     """Return the last stage of the range maps that compared the views, and what it found of each."""
-    metrics = {summary.name: summary.unit_metrics for summary in run.result.stages}
+    metrics = {summary.stage: summary.unit_metrics for summary in run.result.stages}
     for name in reversed(chain_of(run.workflow, run.graph, RangeMap)):
         found = {
             view: Agreement(*(values[figure] for figure in _FIGURES))

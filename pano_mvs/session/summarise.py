@@ -57,9 +57,7 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
     workflow, result = run.workflow, run.result
     scores = _scores(run)
     blocked = tuple(
-        BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause)
-        for failure in result.failures
-        if failure.blocked
+        BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause) for failure in result.blocked
     )
     results = final_stages(run)
     poses = _poses(run, blocked)
@@ -77,17 +75,11 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         seconds=round(seconds, 3),
         exit_code=result.exit_code,
         stopped=result.stopped,
-        units=UnitCounts(
-            run=result.computed,
-            cached=result.cached,
-            failed=sum(stage.failed for stage in result.stages),
-            blocked=sum(stage.blocked for stage in result.stages),
-        ),
+        units=UnitCounts(**result.units),
         stages=tuple(_stage(summary, workflow) for summary in result.stages),
         failures=tuple(
             FailedUnit(**{name: getattr(failure, name) for name in FailedUnit.model_fields})
             for failure in result.failures
-            if not failure.blocked
         ),
         blocked=blocked,
         rejected=_reasons(result.rejected),
@@ -114,10 +106,11 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
 
 
 def _stage(summary: StageSummary, workflow: Workflow) -> StageOutcome:
-    entry = workflow.stages[summary.name]
-    same = ("name", "use", "units", "run", "cached", "failed", "blocked", "metrics")
+    entry = workflow.stages[summary.stage]
+    same = ("use", "units", "run", "cached", "failed", "blocked", "metrics")
     return StageOutcome(
         **{name: getattr(summary, name) for name in same},
+        name=summary.stage,
         version=entry.spec.version,
         params=entry.params.model_dump(mode="json"),
         seconds=round(summary.seconds, 3),
@@ -150,8 +143,8 @@ def _links(run: Run) -> tuple[PairLink, ...]:
     """Return the pairs that were matched, with what later stages that judge all pairs found."""
     matched: dict[tuple[str, ...], Mapping[str, float]] = {}
     for stage in run.result.stages:
-        if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
-            images = run.states[stage.name].members
+        if issubclass(run.workflow.stages[stage.stage].spec.output, TwoView):
+            images = run.states[stage.stage].members
             matched |= {images[pair]: metrics for pair, metrics in stage.unit_metrics.items()}
     views = latest(run, TwoViews)
     return pair_links(matched, {} if views is None else views.views)
@@ -305,8 +298,8 @@ def _scores(run: Run) -> dict[str, ScoresSummary]:
 
 
 def _views(run: Run, stage_name: str) -> tuple[ViewSummary, ...]:
-    stage = next((summary for summary in run.result.stages if summary.name == stage_name), None)
-    if stage is None or run.states[stage.name].axis is not Axis.VIEW:
+    stage = next((summary for summary in run.result.stages if summary.stage == stage_name), None)
+    if stage is None or run.states[stage.stage].axis is not Axis.VIEW:
         return ()
     previews: dict[str, str] = {}
     for path in run.result.published:
@@ -319,13 +312,13 @@ def _views(run: Run, stage_name: str) -> tuple[ViewSummary, ...]:
             preview=previews.get(str(PurePosixPath(item).with_suffix("")), previews.get(item, "")),
             metrics={name: round(value, 6) for name, value in stage.unit_metrics.get(item, {}).items()},
         )
-        for item in run.states[stage.name].items
+        for item in run.states[stage.stage].items
     )
 
 
 def _cloud(run: Run) -> CloudSummary:
     chain = chain_of(run.workflow, run.graph, PointCloud)
-    stage = next((summary for summary in reversed(run.result.stages) if summary.name in chain), None)
+    stage = next((summary for summary in reversed(run.result.stages) if summary.stage in chain), None)
     points = stage.metrics.get("points") if stage else None
     return CloudSummary(points=None if points is None else int(points))
 

@@ -270,8 +270,7 @@ class EventObserver:
     def __call__(self, event: Event | None) -> None:
         """Pass on an event (None: there is none), and once a second compiled kernels, workers and the time left."""
         if event is not None:
-            self._estimator(event)
-            self._progress(event)
+            self._pass_on(event)
         now = self._clock()
         if now < self._next_estimate_s:
             return
@@ -279,15 +278,15 @@ class EventObserver:
         self._next_estimate_s = now + _ESTIMATE_EVERY_S
         if (kernels := count_compiled()) > self._kernels:
             self._kernels = kernels
-            compiled = KernelsCompiled(kernels - self._kernels_before, round(since_s, 6))
-            self._estimator(compiled)
-            self._progress(compiled)
+            self._pass_on(KernelsCompiled(kernels - self._kernels_before, round(since_s, 6)))
         if self._executor is not None:
             if (workers := self._executor.places()) != self._workers:
                 self._workers = workers
-                changed = WorkersChanged(workers)
-                self._estimator(changed)
-                self._progress(changed)
+                self._pass_on(WorkersChanged(workers))
             if notice := self._executor.notice():
                 self._progress(Warned(notice))
         self._progress(self._estimator.estimate())
+
+    def _pass_on(self, event: Event) -> None:
+        self._estimator(event)
+        self._progress(event)

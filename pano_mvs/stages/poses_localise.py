@@ -38,6 +38,7 @@ from pano_mvs.io.images.metadata import focal_from_exif, read_container
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.scene.record import FilePart
 from pano_mvs.stages.features import NetworkParams
 
@@ -62,7 +63,9 @@ class LocaliseParams(NetworkParams):
     candidates: int = Field(
         default=20, ge=0, description="number of most similar panoramas to match each photograph with; 0: all"
     )
-    min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of ranges (128: consistent)")
+    min_confidence: int = Field(
+        default=CONSISTENT_CONFIDENCE[0], ge=1, le=255, description="minimum confidence of ranges (128: consistent)"
+    )
 
     @field_validator("path")
     @classmethod

@@ -36,6 +36,7 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
+from pano_mvs.testing.exporters import exporter_tests
 from pano_mvs.testing.stage_calls import Call, StageCase, digest_of
 from pano_mvs.testing.sweep_backends import CASES, agreement, cost_of_case, sweep_case
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
@@ -192,8 +193,8 @@ def stage_contract_tests(
     return [
         ContractTest(f"{case.spec.name} {what}", partial(check, case))
         for case in (StageCase(spec, settings or {}, inputs or {}, size_hw) for spec in _specs(stage))
-        for what, check in _CONTRACT.items()
-        if _applies(what, case.spec)
+        for what, check in (_CONTRACT | exporter_tests(case.spec)).items()
+        if what not in _CONTRACT or _applies(what, case.spec)
     ]
 
 

@@ -31,6 +31,8 @@ class Call:
     refusal: PanoMvsError | None = None  # the error by which the stage rejected its inputs
     # (H, W) valid pixels of a returned panorama, whose files no longer exist after the call
     mask: NDArray[np.bool_] | None = None
+    notes: tuple[str, ...] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict)  # target to the content of a returned file
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +89,11 @@ class StageCase:
             require_valid(value, self.spec, Path(scratch))
             figures = {name: float(metric).hex() for name, metric in context.metrics.items()}
             told = [figures, context.notes, context.rejected]
+            digest = digest_from_value([digest_of(value), json.dumps(told)])
             mask = value.load_mask() if isinstance(value, Panorama) else None
-            return Call(value, digest_from_value([digest_of(value), json.dumps(told)]), mask=mask)
+            written = value.files if isinstance(value, Files) else {}
+            files = {target: path.read_bytes() for target, path in written.items()}
+            return Call(value, digest, mask=mask, notes=(*context.notes,), files=files)
 
     def _argument(self, port: Port, capture: TinyCapture) -> Any:
         items = capture.items.get(port.kind)

@@ -114,6 +114,17 @@ def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Pat
         assert one["color_rgb"] == here.tolist()
 
 
+def test_a_run_in_which_an_image_failed_can_be_inspected(run: Path, tmp_path: Path) -> None:
+    for name in ("wf.yaml", "halved.json"):
+        shutil.copy(run / name, tmp_path)
+    shutil.copytree(run / "capture", tmp_path / "capture")
+    whole = (tmp_path / "capture" / "images" / "000.png").read_bytes()
+    (tmp_path / "capture" / "images" / "half.png").write_bytes(whole[: len(whole) // 2])
+    outcome = call("run", tmp_path / "wf.yaml", "--out", tmp_path / "out", "--cache", run / "cache")
+    assert outcome.code == 3, outcome.text
+    assert inspected(tmp_path / "out", "001", 40, 28) == inspected(run / "out", "001", 40, 28)
+
+
 def test_other_settings_are_tried_without_a_run(run: Path) -> None:
     found = inspected(run / "out", "000.png", 40, 28, "--set", "depth.cost=zncc", "--set", "depth.planes=40")
     assert len(found["curve"]["ranges"]) == 40

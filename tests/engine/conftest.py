@@ -108,7 +108,7 @@ def settle(path: Path) -> None:
 
 
 def ran(result: RunResult) -> dict[str, int]:
-    return {stage.name: stage.run for stage in result.stages if stage.run}
+    return {stage.stage: stage.run for stage in result.stages if stage.run}
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 def run(folder: Path) -> dict[str, int]:
     session = open_session(str(folder / "wf.yaml"), cache=folder / "cache", out=folder / "out")
     result = Run(session.workflow, session.graph, Store(session.store_root), out=session.out).execute()
-    return {stage.name: stage.run for stage in result.stages if stage.run}
+    return {stage.stage: stage.run for stage in result.stages if stage.run}
 
 
 @pytest.mark.slow

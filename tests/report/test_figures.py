@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.report.view_cards import shares_of
-from pano_mvs.results.figures import degrees, duration, figure, median, score_tables, share, words
+from pano_mvs.results.figures import degrees, figure, median, score_tables, share, words
 from pano_mvs.results.records import ScoresSummary
 from pano_mvs.results.residuals import Histogram, histogram, reprojection_residuals
 from pano_mvs.scene import Poses
@@ -33,22 +33,6 @@ from pano_mvs.testing.tiny_capture import TinyCapture
 )
 def test_shares_are_never_rounded_up_to_all(value: float | None, text: str) -> None:
     assert share(value) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.04, "0.0 s"),
-        (9.94, "9.9 s"),
-        (9.96, "10 s"),
-        (59.6, "1 min 00 s"),
-        (187.2, "3 min 07 s"),
-        (7620, "2 h 07 min"),
-        (None, "–"),
-    ],
-)
-def test_durations_are_those_of_a_clock(seconds: float | None, text: str) -> None:
-    assert duration(seconds) == text
 
 
 @pytest.mark.parametrize(

@@ -169,16 +169,6 @@ def test_groups_have_a_plan_each_and_too_few_points_none(tmp_path: Path) -> None
     assert stated(files, "floor_plan_1")["unit"] == "scene unit"
 
 
-def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path) -> None:
-    contents = []
-    for name in ("a", "b"):
-        files, _ = planned(
-            tmp_path / name, the_cloud(room_cloud()), the_poses((2, 2, 1.5)), formats=("png", "svg", "dxf")
-        )
-        contents.append({target: path.read_bytes() for target, path in files.files.items()})
-    assert contents[0] == contents[1]
-
-
 def test_too_many_pixels_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pano_mvs.stages.exports.floor_plan._MAX_SIDE_PX", 300)
     files, ctx = planned(tmp_path, the_cloud(room_cloud()), the_poses((2, 2, 1.5)), pixel=0.0005, formats=("svg",))

@@ -35,7 +35,6 @@ from pano_mvs.stages.exports.colmap import (
     colmap_dense,
     colmap_dense_init,
 )
-from pano_mvs.stages.exports.files import PlyParams, ply
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
@@ -145,21 +144,6 @@ def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> N
     assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
 
 
-def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
-    cloud = _fused(rooms)
-    files = ply(cloud=cloud, poses=None, params=PlyParams(), ctx=ctx).files
-    assert list(files) == ["cloud.ply", "cloud_1.ply"]
-    for path, group in zip(files.values(), cloud.groups(), strict=True):
-        np.testing.assert_array_equal(read_ply(path).points_in_world, group.points_in_world)
-    assert ctx.metrics["points"] == len(cloud)
-
-
-@pytest.mark.slow
-def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context) -> None:
-    files = mesh(cloud=_fused(rooms), poses=None, params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
-    assert list(files) == ["mesh.ply", "mesh_1.ply"]
-
-
 def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: Context) -> None:
     large = _fused(rooms).groups()[0]
     shorter: dict[str, Any] = {name: value[:5] for name, value in vars(large).items() if isinstance(value, np.ndarray)}
@@ -181,18 +165,6 @@ def _placed(files: Files, folder: Path) -> Path:
 def _model_images(folder: Path) -> dict[str, np.ndarray]:
     model = pycolmap.Reconstruction(folder)
     return {image.name: image.projection_center() for image in model.images.values()}
-
-
-def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    out = _placed(
-        colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx), tmp_path
-    )
-    assert sorted(path.name for path in (out / "colmap" / "sparse").iterdir()) == ["0", "1"]
-    for number, group in enumerate(split_groups(rooms.poses)):
-        centers = _model_images(out / "colmap" / "sparse" / str(number))
-        assert centers.keys() == set(group.names)
-        for name, center in zip(group.names, group.centers, strict=True):
-            np.testing.assert_allclose(centers[name], center, atol=1e-9)
 
 
 def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(

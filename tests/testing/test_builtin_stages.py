@@ -20,6 +20,8 @@ from tests.io.images.videos import tiny_video
 from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
 
 SETTINGS: dict[str, dict[str, Any]] = {
+    "export.floor_plan": {"formats": ["png", "svg", "dxf"]},
+    "export.mesh": {"depth": 5},
     "depth.prior": {"network": str(GREY_NETWORK)},
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.localise": {"path": "{capture}/phone", "candidates": 1},  # each panorama takes 0.7 s

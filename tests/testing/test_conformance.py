@@ -24,8 +24,11 @@ from pano_mvs.api import (
     FilePart,
     Files,
     InputError,
+    Names,
+    One,
     Panorama,
     Params,
+    Poses,
     RangeMap,
     Record,
     UsageError,
@@ -33,6 +36,7 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.errors import ContractError
+from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.testing.conformance import backend_contract_tests, check_stage, cost_contract_tests, stage_contract_tests
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
@@ -218,6 +222,54 @@ def leaves_a_thread(x: Each[RangeMap]) -> RangeMap:
     return x
 
 
+def exporter(function: Callable[[Path, Poses, tuple[str, ...]], None]) -> Callable[..., Any]:
+    @stage(f"bad.{function.__name__}")
+    def export(poses: One[Poses], images: Names[Panorama], ctx: Context) -> Files:
+        """Write something about the poses, in the world."""
+        function(ctx.scratch, poses, tuple(images))
+        return Files({path.name: path for path in sorted(ctx.scratch.iterdir())})
+
+    export.__name__ = function.__name__
+    return export
+
+
+@exporter
+def beside(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    Path("beside.txt").write_text("a file in the current folder")
+
+
+@exporter
+def unquoted(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    (scratch / "poses.json").write_text(f'["{poses.names[0]}"]')
+
+
+@exporter
+def flattened(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    for name in poses.names:
+        (scratch / f"{name.partition('/')[0]}.bin").touch()
+
+
+@exporter
+def unregistered(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    (scratch / "images.bin").write_text("".join(images))
+
+
+@exporter
+def first_group(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    split_groups(poses)[0].centers.tofile(scratch / "centers.bin")
+
+
+@exporter
+def mixed_groups(scratch: Path, poses: Poses, images: tuple[str, ...]) -> None:
+    poses.centers.tofile(scratch / "centers.bin")
+
+
+@stage("bad.no_frame")
+def no_frame(poses: One[Poses], ctx: Context) -> Files:
+    """Write nothing."""
+    return Files({})
+
+
 BROKEN_BY = {
     undocumented: "declares itself",
     misnamed: "declares itself",
@@ -227,8 +279,8 @@ BROKEN_BY = {
     unsound: "returns what it declares|returns the same|accepts or rejects|respects|rolls|leaves its process",
     scribbles: "returns what it declares|returns the same|accepts or rejects|respects|rolls|leaves its process",
     forces: "returns what it declares|returns the same|rolls",
-    elsewhere: "returns what it declares|returns the same|accepts or rejects|leaves its process",
-    never_written: "returns what it declares|returns the same|accepts or rejects|leaves its process",
+    elsewhere: "returns what it declares|returns the same|accepts or rejects|leaves its process|scratch",
+    never_written: "returns what it declares|returns the same|accepts or rejects|leaves its process|scratch",
     changes_libraries: "leaves its process",
     leaves_a_thread: "leaves its process",
     draws: "returns the same bytes",
@@ -242,6 +294,13 @@ BROKEN_BY = {
     sees_masked: "respects masks",
     looks_behind_the_mask: "does not depend on masked content",
     stops_at_the_seam: "rolls with",
+    beside: "writes to its scratch folder only",
+    unquoted: "accepts images of any name",
+    flattened: "accepts images of any name",
+    unregistered: "leaves out images without a pose|keeps groups",
+    first_group: "keeps groups",
+    mixed_groups: "keeps groups",
+    no_frame: "states the frame",
 }
 
 

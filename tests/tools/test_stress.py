@@ -48,7 +48,7 @@ def test_hostile_files_take_little_memory_and_end_no_run() -> None:
 
 @pytest.mark.slow
 def test_much_damage_is_healed_by_processes() -> None:
-    assert damage.main(80) == 0
+    assert damage.main(40) == 0
 
 
 def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.nearest_two import Comparable
+from pano_mvs.algorithms.matching.nearest_two import MAX_RATIO, Comparable
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
@@ -19,7 +19,7 @@ def match_features(
     first: Features,
     second: Features,
     *,
-    ratio: Annotated[float, Setting("maximum ratio of best to second-best distance", gt=0, le=1)] = 0.8,
+    ratio: Annotated[float, Setting("maximum ratio of best to second-best distance", gt=0, le=1)] = MAX_RATIO,
     mutual: Annotated[bool, Setting("keep only matches that are each other's best")] = True,
 ) -> NDArray[np.int32]:
     """Match the key points of two images by their descriptors.
@@ -49,7 +49,7 @@ def match_features(
 
 
 def match_l2(
-    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = 0.8, mutual: bool = True
+    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = MAX_RATIO, mutual: bool = True
 ) -> NDArray[np.int32]:
     """Match descriptors, (N, D) and (M, D), by Euclidean distance; see `match_features`."""
     found = Comparable(first).nearest_two(Comparable(second))

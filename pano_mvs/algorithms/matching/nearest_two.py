@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_BLOCK_ROWS = 256
+MAX_RATIO = 0.8  # of the distances to the nearest and the second nearest, by default (Lowe 2004, section 7.1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,8 +20,8 @@ class NearestTwo:
     squared_back: NDArray[np.float32]  # (M,) float32, from each descriptor of the other image to its nearest one
 
     def mutual(self) -> NDArray[np.bool_]:
-        """Return which pass the ratio test of Lowe 2004, section 7.1, and are mutually the nearest, (N,)."""
-        distinct = self.squared < np.float32(0.8**2) * self.next_squared
+        """Return which pass the ratio test and are mutually the nearest, (N,)."""
+        distinct = self.squared < np.float32(MAX_RATIO**2) * self.next_squared
         return np.asarray(distinct & (self.squared <= self.squared_back[self.nearest]))
 
 
@@ -37,8 +37,8 @@ def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> Near
     nearest = np.empty(len(a), np.intp)
     best, runner_up = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
     best_back = np.full(len(b), -np.inf, np.float32)
-    for start in range(0, len(a), _BLOCK_ROWS):
-        rows = slice(start, start + _BLOCK_ROWS)
+    for start in range(0, len(a), 256):
+        rows = slice(start, start + 256)
         # a·b − |a|²/2 − |b|²/2 is minus half of the squared distance.
         closeness = a[rows] @ b.T
         closeness -= half_b

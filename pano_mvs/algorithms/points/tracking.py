@@ -18,6 +18,7 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, ray_from_pixel, spiral_rays
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 
 
@@ -28,7 +29,9 @@ def sample_surface(
     range_map: RangeMap,
     *,
     count: Annotated[int, Setting("number of evenly spread directions to sample in each view", ge=1)] = 80_000,
-    min_confidence: Annotated[int, Setting("minimum confidence of ranges (128: consistent)", ge=1, le=255)] = 128,
+    min_confidence: Annotated[
+        int, Setting("minimum confidence of ranges (128: consistent)", ge=1, le=255)
+    ] = CONSISTENT_CONFIDENCE[0],
 ) -> SurfaceSamples:
     """Return points of the surfaces that a view sees, one for each of `count` evenly spread directions.
 

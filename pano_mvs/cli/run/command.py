@@ -17,6 +17,7 @@ import typer
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
+from pano_mvs.cli.endings import ending_text
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
@@ -104,20 +105,6 @@ def interrupted_by_termination() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-_ENDINGS = {
-    0: "finished",
-    2: "not possible: there is a mistake in the command, the workflow or the input",
-    3: "finished, but some items failed or were left out, or some cameras are doubtful",
-    4: "stopped by a quality threshold or a safety check",
-    130: "interrupted",
-}
-
-
-def ending_text(exit_code: int) -> str:
-    """Return how a run ended, by its exit code."""
-    return _ENDINGS.get(exit_code, "ended by an internal error")
 
 
 @contextmanager

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 
 from rich.markup import escape
 from rich.table import Table
@@ -13,7 +12,8 @@ from rich.table import Table
 from pano_mvs.cli.console import Console
 from pano_mvs.core.paths import resolved
 from pano_mvs.core.text import one_line, plural
-from pano_mvs.results.records import Number, ScoresSummary, Verdict
+from pano_mvs.results.figures import score_tables, side_by_side
+from pano_mvs.results.records import ScoresSummary, Verdict
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.session.session import Session, run_command
@@ -42,7 +42,9 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
         text = f"poses: {len(poses.registered)} of {total} registered, {points}; scale: {poses.scale}"
         console.print(escape(text), highlight=False)
     print_scores(summary.scores, console)
-    _print_comparison(summary.all_scores, console)
+    all_scores = [(stage, score_tables(each, only=list(_SHOWN_SCORES))) for stage, each in summary.all_scores.items()]
+    if rows := side_by_side(all_scores)["rows"]:
+        _print_table("median over views", rows, console)
     for note in summary.notes:
         console.say(f"note: {escape(note)}")
     if summary.left_over:
@@ -132,29 +134,17 @@ def print_scores(scores: ScoresSummary, console: Console) -> None:
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)
-    if not scores.views:
-        return
-    table = Table("view", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
-    for view, values in scores.views.items():
-        table.add_row(escape(view), *(_beside_constant(values, name) for name in _SHOWN_SCORES))
+    if scores.views:
+        _print_table("view", score_tables(scores, only=list(_SHOWN_SCORES))["views"], console)
+
+
+def _print_table(name: str, rows: Sequence[tuple[str, Sequence[str]]], console: Console) -> None:
+    table = Table(name, *_SHOWN_SCORES.values(), caption="in brackets: the best of all constant ranges")
+    for item, cells in rows:
+        table.add_row(escape(item), *cells)
     console.print(table)
 
 
-def _print_comparison(all_scores: Mapping[str, ScoresSummary], console: Console) -> None:
-    """Print the medians over views of several scored branches side by side."""
-    if len(all_scores) < 2:
-        return
-    table = Table("median over views", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
-    for stage, scores in all_scores.items():
-        views = scores.views.values()
-        names = {name for view in views for name in view}
-        found = {name: [value for view in views if (value := view.get(name)) is not None] for name in names}
-        middle = {name: median(values) for name, values in found.items() if values}
-        table.add_row(escape(stage), *(_beside_constant(middle, name) for name in _SHOWN_SCORES))
-    console.print(table)
-
-
-_IN_BRACKETS = "in brackets: the best of all constant ranges"
 _SHOWN_SCORES = {
     "psnr_db": "PSNR dB",
     "w_mae": "MAE",
@@ -166,14 +156,3 @@ _SHOWN_SCORES = {
 
 AUSE is the area between the sparsification curve of the confidence and that of the true errors.
 """
-
-
-def _beside_constant(values: Mapping[str, Number], name: str) -> str:
-    constant = values.get(f"best_constant_{name}")
-    return _shown(values.get(name)) + ("" if constant is None else f" ({_shown(constant)})")
-
-
-def _shown(value: float | None) -> str:
-    if value is None:
-        return "–"
-    return f"{value:z.3g}" if abs(value) < 1 else f"{value:.2f}"

@@ -62,7 +62,11 @@ class ProgressDisplay:
                 )
             )
         else:
-            self._open.enter_context(_Repeated(self.print_line, first_s=10.0, every_s=30.0))
+            ended = threading.Event()
+            thread = threading.Thread(target=self._print_lines, args=(ended,), daemon=True)
+            thread.start()
+            self._open.callback(thread.join)
+            self._open.callback(ended.set)  # called before the other one
         return self
 
     def __exit__(
@@ -144,6 +148,12 @@ class ProgressDisplay:
             line = "; ".join([f"{100 * left.done:.0f} %, {text}{now}", *self._further()])
         self.console.say(escape(line))
 
+    def _print_lines(self, ended: threading.Event) -> None:
+        pause_s = 10.0
+        while not ended.wait(pause_s):
+            self.print_line()
+            pause_s = 30.0
+
     def _further(self) -> list[str]:
         """Return lines to show below the others."""
         return []
@@ -176,25 +186,3 @@ def _units(stage: StageProgress) -> Text:
     """Return the units that are being computed; nothing for a stage with a single unit."""
     names = [one_line(item) for item in stage.running if item]
     return Text(shortened_list(names, 2, rest=" and {more} more"), overflow="ellipsis", no_wrap=True)
-
-
-class _Repeated:
-    """A context during which a function is called again and again by a thread."""
-
-    def __init__(self, function: Callable[[], None], *, first_s: float, every_s: float) -> None:
-        self._function, self._first_s, self._every_s = function, first_s, every_s
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._repeat, daemon=True)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _repeat(self) -> None:
-        pause_s = self._first_s
-        while not self._end.wait(pause_s):
-            self._function()
-            pause_s = self._every_s

@@ -81,9 +81,6 @@ class Queue(BaseModel):
         return share_cores(self.cores, workers=places, threads=threads)
 
 
-_KEYS = (*Queue.model_fields, "partition", "project")
-
-
 def read_queue(path: Path) -> Queue:
     """Read the settings of the jobs from a YAML file.
 
@@ -99,7 +96,7 @@ def read_queue(path: Path) -> Queue:
         try:
             queue = Queue.model_validate(root.plain())
         except ValidationError as error:
-            report_invalid(error, root, problems, known=_KEYS)
+            report_invalid(error, root, problems, model=Queue, also=("partition", "project"))
     problems.raise_if_any()
     return queue
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -186,12 +186,14 @@ def make_plan(
     options: RunOptions = DEFAULT_OPTIONS,
     listing: SourceListing | None = None,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
+    failed: Collection[tuple[str, str]] = (),
 ) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
 
     Args:
         listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
+        failed: stages and units that have no result; by default, all units are expected to have one.
 
     Raises:
         InputError: if the source cannot be listed.
@@ -209,6 +211,8 @@ def make_plan(
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
+            elif (name, unit.item) in failed:
+                state.failed[unit.item] = "failed in the latest run"
             else:
                 state.pending.add(unit.item)
                 plan.run[unit.item] = "--refresh" if is_asked else reason_to_run(unit, last_key, store)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
-
-from pano_mvs.engine.workflows.workflow import StageEntry
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, Literal, get_args
 
 UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
@@ -22,45 +20,40 @@ class UnitFailed:
     consequence: str = ""  # what the result lacks because of it
     log: str = ""  # file with what the unit printed; empty if it printed nothing
     said: tuple[str, ...] = ()  # the last lines that it printed
-
-
-@dataclass(frozen=True, slots=True)
-class Failure(UnitFailed):
-    """A unit without a result: its event, and what that leaves out."""
-
     trace: str = ""  # the Python traceback, if the code of the stage failed
-    blocked: bool = False  # whether the unit did not run because one of its inputs failed
-
-    def event(self) -> UnitFailed:
-        """Return the event that the unit has failed."""
-        return UnitFailed(self.stage, self.item, self.cause, self.consequence, self.log, self.said)
-
-
-def consequence_of(entry: StageEntry, item: str) -> str:
-    """Return what is missing in the results without a unit."""
-    kind = entry.spec.output.kind_name()
-    return f"there is no {kind} for {item}" if item else f"there is no {kind}"
 
 
 @dataclass(slots=True)
-class StageSummary:
-    """What happened in one stage."""
+class StageFinished:
+    """A stage is done."""
 
-    name: str  # of the stage in the workflow
-    use: str  # of the stage in the registry
+    kind: ClassVar[str] = "stage_finished"
+    stage: str  # its name in the workflow
+    use: str  # the registered stage, such as `depth.sweep`
     units: int = 0
-    cached: int = 0
-    run: int = 0
-    failed: int = 0
-    blocked: int = 0
+    run: int = 0  # of these computed
+    cached: int = 0  # taken from the cache
+    failed: int = 0  # without a result
+    blocked: int = 0  # not run, because an input failed
     # time during which at least one of its units was being computed; other stages may have run too
     seconds: float = 0.0
-    unit_seconds: float = 0.0  # computing time of its units together
+    unit_seconds: float = 0.0  # sum over its computed units
+    # mean over its units of each figure that the stage reports
+    metrics: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class StageSummary(StageFinished):
+    """What has happened in one stage so far: the counts of its event, and what else the summary of the run needs."""
+
     slowest_s: float = 0.0  # computing time of its slowest unit
     stored_bytes: int = 0  # bytes of the results that its computed units stored in the cache
-    metrics: dict[str, float] = field(default_factory=dict)  # mean of each metric over the units
     unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)  # unit to its own metrics
     notes: list[str] = field(default_factory=list)
+    # unit to its own notes, and to the images that it rejects or doubts, with the reasons
+    unit_notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rejected: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    doubts: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def typical_unit_s(self) -> float:
@@ -71,9 +64,9 @@ class StageSummary:
 
     def event(self) -> StageFinished:
         """Return the event that the stage is complete."""
-        counts = self.units, self.run, self.cached, self.failed, self.blocked
-        times = round(self.seconds, 6), round(self.unit_seconds, 6)
-        return StageFinished(self.name, self.use, *counts, *times, dict(self.metrics))
+        counts = {each.name: getattr(self, each.name) for each in fields(StageFinished)}
+        times = {name: round(counts[name], 6) for name in ("seconds", "unit_seconds")}
+        return StageFinished(**counts | times)
 
 
 @dataclass(slots=True)
@@ -82,7 +75,8 @@ class RunResult:
 
     # those that were started, in the order of the workflow
     stages: list[StageSummary] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)  # units without a result
+    failures: list[UnitFailed] = field(default_factory=list)
+    blocked: list[UnitFailed] = field(default_factory=list)  # units that did not run because one of their inputs failed
     # image to the stage that left it out and the reason
     rejected: dict[str, tuple[str, str]] = field(default_factory=dict)
     # image to the stage that finds it doubtful and the reason; see `Record.doubted`
@@ -101,17 +95,17 @@ class RunResult:
     @property
     def complete(self) -> bool:
         """Whether nothing failed and no image was left out; doubtful results count as complete."""
-        return not (self.stopped or self.failures or self.rejected)
+        return not (self.stopped or self.failures or self.blocked or self.rejected)
+
+    @property
+    def units(self) -> dict[str, int]:
+        """Number of units of all stages, by outcome."""
+        return {status: sum(getattr(stage, status) for stage in self.stages) for status in get_args(UnitStatus)}
 
     @property
     def computed(self) -> int:
         """Number of units that were computed rather than found in the cache."""
-        return sum(stage.run for stage in self.stages)
-
-    @property
-    def cached(self) -> int:
-        """Number of units that were found in the cache."""
-        return sum(stage.cached for stage in self.stages)
+        return self.units["run"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,23 +135,6 @@ class UnitFinished:
     item: str
     outcome: UnitStatus
     seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class StageFinished:
-    """A stage is done."""
-
-    kind: ClassVar[str] = "stage_finished"
-    stage: str
-    use: str  # the registered stage, such as `depth.sweep`
-    units: int
-    run: int  # of these computed
-    cached: int  # taken from the cache
-    failed: int  # without a result
-    blocked: int  # not run, because an input failed
-    seconds: float  # time during which at least one of its units was being computed
-    unit_seconds: float  # sum over its computed units
-    metrics: Mapping[str, float]  # mean over its units of each figure that the stage reports
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
-from pano_mvs.engine.running.events import Failure, Observer, RunResult, Warned, consequence_of, ignore
+from pano_mvs.engine.running.events import Observer, RunResult, UnitFailed, Warned, ignore
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
@@ -231,7 +231,7 @@ class Run:
         size = self.listing.size()
         for summary in computed:
             sample = Sample(
-                settings_digest(self.workflow.stages[summary.name]),
+                settings_digest(self.workflow.stages[summary.stage]),
                 self.executor.threads,
                 images=size.images,
                 pixels=size.pixels,
@@ -393,11 +393,11 @@ class RunPass:
         """Record a failed unit; stop the run if the workflow asks for it or if all other units depend on this one."""
         unit, outcome = finished.unit, finished.outcome
         entry = unit.entry
-        failure = Failure(
+        failure = UnitFailed(
             entry.name,
             unit.item,
             outcome.cause,
-            consequence_of(entry, unit.item),
+            f"there is no {entry.spec.output.kind_name()}{f' for {unit.item}' if unit.item else ''}",
             "" if finished.log is None else str(finished.log),
             finished.said,
             outcome.trace,

@@ -6,7 +6,6 @@ import time
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from struct import Struct
 
 from pano_mvs.core.errors import InputError, RunStoppedError
@@ -14,31 +13,17 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import (
-    Failure,
     Observer,
     RunResult,
     StageStarted,
     StageSummary,
+    UnitFailed,
     UnitFinished,
     UnitStarted,
     UnitStatus,
-    consequence_of,
 )
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
-
-
-@dataclass(slots=True)
-class _StageCount:
-    """A stage's summary, and what its units reported, which goes into the summary once the stage is complete."""
-
-    summary: StageSummary
-    running: set[str] = field(default_factory=set)
-    began: float = 0.0  # since when at least one unit is being computed
-    metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
-    notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    rejected: dict[str, dict[str, str]] = field(default_factory=dict)
-    doubts: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 class RunStatistics:
@@ -62,7 +47,9 @@ class RunStatistics:
         self._observer = observer
         self._states = states
         self._name_items = name_items
-        self._counts: dict[str, _StageCount] = {}
+        self._summaries: dict[str, StageSummary] = {}
+        self._running: dict[str, set[str]] = {}  # stage to its units that are being computed
+        self._began: dict[str, float] = {}  # stage to the time since when there are any
         self._source_notes: dict[str, Mapping[str, tuple[str, ...]]] = {}
 
     def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
@@ -73,8 +60,9 @@ class RunStatistics:
     def stage_opened(self, entry: StageEntry) -> None:
         """Begin to count a stage's units."""
         units = len(self._states(entry.name).pending)
-        self._counts[entry.name] = _StageCount(StageSummary(entry.name, entry.spec.name, units))
-        self._result.stages.append(self._counts[entry.name].summary)
+        self._running[entry.name] = set()
+        self._summaries[entry.name] = summary = StageSummary(entry.name, entry.spec.name, units)
+        self._result.stages.append(summary)
         self._observer(StageStarted(entry.name, units))
 
     def unit_blocked(self, entry: StageEntry, item: str, reason: str) -> None:
@@ -83,55 +71,51 @@ class RunStatistics:
         Raises:
             RunStoppedError: if the workflow says that such an image ends the run.
         """
-        summary = self._counts[entry.name].summary
+        summary = self._summaries[entry.name]
         if entry.spec.list_items is not None:
             summary.failed += 1
-            failure = Failure(entry.name, item, reason, consequence="the run goes on without this image")
+            consequence = "the run goes on without this image"
+            self._result.failures.append(UnitFailed(entry.name, item, reason, consequence))
         else:
             summary.blocked += 1
-            failure = Failure(entry.name, item, f"it {reason}", consequence=consequence_of(entry, item), blocked=True)
-        self._result.failures.append(failure)
+            self._result.blocked.append(UnitFailed(entry.name, item, f"it {reason}"))
         self._observer(UnitFinished(entry.name, item, "blocked", 0.0))
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
 
     def unit_started(self, entry: StageEntry, item: str) -> None:
         """Record that a unit is being computed."""
-        count = self._counts[entry.name]
-        if not count.running:
-            count.began = time.perf_counter()
-        count.running.add(item)
+        if not self._running[entry.name]:
+            self._began[entry.name] = time.perf_counter()
+        self._running[entry.name].add(item)
         self._observer(UnitStarted(entry.name, item))
 
     def unit_done(self, entry: StageEntry, item: str, record: UnitRecord, *, status: UnitStatus) -> None:
         """Count a unit with a result."""
-        count = self._counts[entry.name]
-        self._stop_clock(count, item)
+        summary = self._stop_clock(entry.name, item)
         if status == "run":
-            count.summary.run += 1
-            count.summary.unit_seconds += record.seconds
-            count.summary.slowest_s = max(count.summary.slowest_s, record.seconds)
-            count.summary.stored_bytes += sum({ref.digest: ref.size_bytes for ref in record.own_blobs()}.values())
+            summary.run += 1
+            summary.unit_seconds += record.seconds
+            summary.slowest_s = max(summary.slowest_s, record.seconds)
+            summary.stored_bytes += sum({ref.digest: ref.size_bytes for ref in record.own_blobs()}.values())
         else:
-            count.summary.cached += 1
+            summary.cached += 1
         if record.metrics:
-            count.metrics[item] = PackedFigures(record.metrics)
+            summary.unit_metrics[item] = PackedFigures(record.metrics)
         if record.notes:
-            count.notes[item] = record.notes
+            summary.unit_notes[item] = record.notes
         if record.rejected:
-            count.rejected[item] = dict(record.rejected)
+            summary.rejected[item] = record.rejected
         if record.doubts:
-            count.doubts[item] = dict(record.doubts)
+            summary.doubts[item] = record.doubts
         seconds = round(record.seconds, 6) if status == "run" else 0.0
         self._observer(UnitFinished(entry.name, item, status, seconds))
 
-    def unit_failed(self, failure: Failure, seconds: float) -> None:
+    def unit_failed(self, failure: UnitFailed, seconds: float) -> None:
         """Count a unit without a result."""
-        count = self._counts[failure.stage]
-        self._stop_clock(count, failure.item)
-        count.summary.failed += 1
+        self._stop_clock(failure.stage, failure.item).failed += 1
         self._result.failures.append(failure)
-        self._observer(failure.event())
+        self._observer(failure)
         self._observer(UnitFinished(failure.stage, failure.item, "failed", round(seconds, 6)))
 
     def stage_complete(self, entry: StageEntry) -> None:
@@ -141,17 +125,18 @@ class RunStatistics:
             InputError: if no image of a source can be used, so that the run cannot go on.
             RunStoppedError: if the stage does not reach the thresholds in its entry.
         """
-        count, state = self._counts[entry.name], self._states(entry.name)
-        summary = count.summary
-        summary.unit_metrics = {item: count.metrics[item] for item in state.items if item in count.metrics}
-        count.metrics = {}  # an emptied dict would keep its memory, that of a million entries
+        summary, state = self._summaries[entry.name], self._states(entry.name)
+        found = summary.unit_metrics
+        summary.unit_metrics = {item: found[item] for item in state.items if item in found}
         values: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
         for metrics in summary.unit_metrics.values():
             for name, value in metrics.items():
                 values[name].append(value)
         summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
-        notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
+        notes = (
+            note for item in state.items for note in (*source_notes.get(item, ()), *summary.unit_notes.get(item, ()))
+        )
         total = len(state.items)
         summary.notes = [
             note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
@@ -177,13 +162,14 @@ class RunStatistics:
                     f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, but `gate` requires {objection}"
                 )
 
-    @staticmethod
-    def _stop_clock(count: _StageCount, item: str) -> None:
-        """Add the time since a unit began, unless others of its stage are still being computed."""
-        if item in count.running:
-            count.running.discard(item)
-            if not count.running:
-                count.summary.seconds += time.perf_counter() - count.began
+    def _stop_clock(self, stage: str, item: str) -> StageSummary:
+        """Add the time since a unit began, unless others of its stage are still being computed; return the summary."""
+        summary, running = self._summaries[stage], self._running[stage]
+        if item in running:
+            running.discard(item)
+            if not running:
+                summary.seconds += time.perf_counter() - self._began[stage]
+        return summary
 
     def put_in_order(
         self,
@@ -198,17 +184,18 @@ class RunStatistics:
             replaced: stages whose results later stages replaced: their doubts do not count any more.
         """
         result = self._result
-        result.stages.sort(key=lambda summary: position_of(summary.name, ""))
-        result.failures.sort(key=lambda failure: position_of(failure.stage, failure.item))
+        result.stages.sort(key=lambda summary: position_of(summary.stage, ""))
+        for units in (result.failures, result.blocked):
+            units.sort(key=lambda unit: position_of(unit.stage, unit.item))
 
         def enter(stage: str, found: Mapping[str, Mapping[str, str]], reasons: dict[str, tuple[str, str]]) -> None:
             for item in sorted(found, key=lambda item: position_of(stage, item)):
                 for image, reason in found[item].items():
                     reasons.setdefault(image, (stage, reason))
 
-        for name in (summary.name for summary in result.stages):
-            enter(name, self._counts[name].rejected, result.rejected)
-            enter(name, {} if name in replaced else self._counts[name].doubts, result.doubts)
+        for summary in result.stages:
+            enter(summary.stage, summary.rejected, result.rejected)
+            enter(summary.stage, {} if summary.stage in replaced else summary.doubts, result.doubts)
 
 
 _positions: dict[tuple[str, ...], tuple[dict[str, int], Struct]] = {}

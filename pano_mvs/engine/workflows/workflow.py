@@ -216,8 +216,9 @@ class WorkflowReader:
         try:
             return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
-            keys = (info.alias or key for key, info in model.model_fields.items())
-            report_invalid(error, node, self.problems, subject=f"stage {name!r}: ", known=(*keys, *RESERVED_KEYS))
+            report_invalid(
+                error, node, self.problems, model=model, also=tuple(RESERVED_KEYS), subject=f"stage {name!r}: "
+            )
             return None
 
     def _bases(self, node: Located) -> dict[str, Path]:

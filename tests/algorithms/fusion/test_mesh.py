@@ -101,15 +101,9 @@ def test_another_program_reads_it_and_finds_one_hole(trimmed: Path) -> None:
     assert np.abs(edges.points - WINDOW[0]).max(axis=1).max() < 1.5 * WINDOW[1]
 
 
-def test_untrimmed_it_is_closed_and_the_same_bytes_again(tmp_path: Path) -> None:
-    results = []
-    for name in ("a", "b"):
-        folder = tmp_path / name
-        folder.mkdir()
-        params = MeshParams(trim=0, depth=5, max_points=3000)
-        results.append(mesh(room_cloud(window=False), None, params, context(folder)).files["mesh.ply"].read_bytes())
-    assert results[0] == results[1]
-    read = pyvista.read(tmp_path / "a" / "mesh.ply")
+def test_untrimmed_it_is_closed(tmp_path: Path) -> None:
+    params = MeshParams(trim=0, depth=5, max_points=3000)
+    read = pyvista.read(mesh(room_cloud(window=False), None, params, context(tmp_path)).files["mesh.ply"])
     assert read.is_manifold
     assert read.n_open_edges == 0
 

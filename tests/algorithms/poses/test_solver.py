@@ -113,13 +113,6 @@ def test_refinement_halves_the_error_and_keeps_the_points(capture: Capture) -> N
     assert np.rad2deg(refined.point_errors_rad.max()) < 0.4
 
 
-def test_the_same_bytes_again(capture: Capture) -> None:
-    _, features, views = capture
-    first, second = (refine_poses(solve(features, views)) for _ in range(2))
-    assert first.rotations.tobytes() == second.rotations.tobytes()
-    assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
-
-
 def test_the_order_of_the_capture_does_not_change_the_scene(capture: Capture) -> None:
     truth, features, views = capture
     backwards = {name: features[name] for name in reversed(features)}

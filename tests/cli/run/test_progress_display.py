@@ -15,7 +15,7 @@ import pytest
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_scores, print_summary
-from pano_mvs.cli.run.progress import ProgressDisplay, _Repeated
+from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.watch_command import WatchDisplay, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
@@ -176,19 +176,12 @@ def test_drawing_ends_with_the_run(is_terminal: bool) -> None:
     assert (size > 0) == is_terminal
 
 
-def test_lines_are_repeated_by_a_thread_until_the_run_ends() -> None:
-    calls: list[int] = []
-    ended = threading.Event()
-
-    def call() -> None:
-        calls.append(1)
-        if len(calls) == 3:
-            ended.set()
-
-    with _Repeated(call, first_s=0.0, every_s=0.0):
-        assert ended.wait(60)
-    count = len(calls)
-    assert count >= 3
+def test_lines_are_repeated_by_a_thread_until_the_run_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, calls = Shown(is_terminal=False), threading.Semaphore(0)
+    monkeypatch.setattr(shown.display, "print_line", calls.release)
+    monkeypatch.setattr("threading.Event.wait", lambda ended, timeout=None: ended.is_set())
+    with shown.display:
+        assert all(calls.acquire(timeout=60) for _ in range(3))
 
 
 def test_lines_do_not_end_up_in_what_a_unit_printed(tmp_path: Path) -> None:
@@ -305,7 +298,7 @@ def test_a_run_is_shown_as_in_its_own_terminal_with_workers_disk_and_range(
 @pytest.mark.parametrize(
     ("end", "said"),
     [
-        (RunFinished(0, "", seconds=90.0), "finished (exit code 0) after 2 min"),
+        (RunFinished(0, "", seconds=90.0), "finished (exit code 0) after 90 s"),
         (RunFinished(4, "the disk is full", seconds=5.0), "check (exit code 4) after 5 s: the disk is full"),
         (RunFinished(130, "interrupted", seconds=5.0), "interrupted (exit code 130) after 5 s"),
     ],

@@ -171,8 +171,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", ["serial", "processes"])
-@pytest.mark.parametrize("place", ["cache", "out"])
+@pytest.mark.parametrize(("place", "executor"), [("cache", "processes"), ("out", "serial")])
 def test_small_disk_fills_up_and_the_run_goes_on_when_it_is_larger(
     tmp_path: Path, small_disk: Path, executor: str, place: str
 ) -> None:

@@ -102,10 +102,10 @@ def test_the_memory_of_stages_for_the_whole_capture_grows_with_it(toy: Toy) -> N
 
 def test_the_slowest_of_four_units_is_left_out_of_what_is_remembered(toy: Toy) -> None:
     result = toy.run()
-    (summary,) = [one for one in result.stages if one.name == "scaled"]
+    (summary,) = [one for one in result.stages if one.stage == "scaled"]
     assert summary.run == 5
     assert summary.typical_unit_s == pytest.approx((summary.unit_seconds - summary.slowest_s) / 4)
-    (single,) = [one for one in result.stages if one.name == "all"]
+    (single,) = [one for one in result.stages if one.stage == "all"]
     assert single.typical_unit_s == single.unit_seconds
 
 

@@ -70,8 +70,8 @@ def keys_and_outputs(store: Path) -> dict[str, object]:
 
 def told(result: RunResult) -> object:
     """Return all that a result says, in its order, without the times and the folders."""
-    stages = [(s.name, s.units, s.run, s.failed, s.blocked, s.metrics, s.unit_metrics, s.notes) for s in result.stages]
-    failures = [(f.stage, f.item, f.cause, f.consequence, f.blocked) for f in result.failures]
+    stages = [(s.stage, s.units, s.run, s.failed, s.blocked, s.metrics, s.unit_metrics, s.notes) for s in result.stages]
+    failures = [(f.stage, f.item, f.cause, f.consequence) for f in (*result.failures, *result.blocked)]
     return (
         stages,
         failures,

@@ -11,7 +11,7 @@ from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.execute import LazyMapping, max_kept_items
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.unit_memory import UnitMemory
+from pano_mvs.engine.running.dispatcher import UnitMemory
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import SourceItem, spec_of
 from pano_mvs.engine.workflows.policy import Policy

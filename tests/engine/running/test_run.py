@@ -51,7 +51,7 @@ def test_first_run_computes_every_unit_and_the_second_none(toy: Toy) -> None:
     before = toy.deliverables()
     second = toy.run()
     assert second.computed == 0
-    assert second.cached == sum(ALL_UNITS.values())
+    assert second.units["cached"] == sum(ALL_UNITS.values())
     assert second.written == []
     assert toy.deliverables() == before
 
@@ -181,7 +181,7 @@ def test_one_failing_item_does_not_end_the_run(toy: Toy) -> None:
     files = toy.deliverables()
     assert "mean/2.txt" in files
     assert "mean/3.txt" not in files
-    blocked = {(f.stage, f.item) for f in result.failures[1:]}
+    blocked = {(f.stage, f.item) for f in result.blocked}
     assert ("mean", "3.txt") in blocked
     assert ("each", "3.txt") in blocked
     toy.number("3.txt", "30")
@@ -288,7 +288,7 @@ def test_a_note_says_how_many_units_gave_it(toy: Toy) -> None:
     ctx.metric("value", x.value)"""
     toy.edit("plug.py", lambda text: text.replace('ctx.metric("value", x.value)', noted))
     for _ in range(2):
-        notes = {stage.name: stage.notes for stage in toy.run().stages}
+        notes = {stage.stage: stage.notes for stage in toy.run().stages}
         assert sorted(notes["scaled"]) == ["3 of 5 are dark", "a {count} in braces"]
 
 

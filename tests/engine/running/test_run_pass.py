@@ -15,7 +15,7 @@ from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, StageState, Unit
 from pano_mvs.engine.running import run as run_module
 from pano_mvs.engine.running.dispatcher import FinishedJob
-from pano_mvs.engine.running.events import Failure, Observer, RunEvent, RunResult, UnitFinished, UnitStarted
+from pano_mvs.engine.running.events import Observer, RunEvent, RunResult, UnitFailed, UnitFinished, UnitStarted
 from pano_mvs.engine.running.events import ignore as ignore_event
 from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
 from pano_mvs.engine.running.statistics import PackedFigures, RunStatistics
@@ -87,7 +87,7 @@ def shelf(tmp_path: Path) -> Shelf:
 
 
 def summary(result: RunResult) -> Mapping[str, tuple[int, int, int, int]]:
-    return {one.name: (one.run, one.cached, one.failed, one.blocked) for one in result.stages}
+    return {one.stage: (one.run, one.cached, one.failed, one.blocked) for one in result.stages}
 
 
 def test_as_many_units_are_out_as_the_executor_takes_and_the_result_is_that_of_one(toy: Toy, shelf: Shelf) -> None:
@@ -191,7 +191,7 @@ def test_a_stop_carries_its_code() -> None:
 def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(toy: Toy, shelf: Shelf) -> None:
     shelf.memory_bytes = 3_000_000
     result = run_with(toy, shelf, "scaled.memory=2MB", "pairs.memory=5MB")
-    (failure,) = [one for one in result.failures if not one.blocked]
+    (failure,) = result.failures
     assert failure.stage == "pairs"
     assert "it declares 5" in failure.cause
     assert summary(result)["scaled"] == (5, 0, 0, 0)
@@ -292,7 +292,7 @@ def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_agai
     result = run_with(toy, shelf)
     assert result.exit_code == 3
     assert result.warnings == [reason]
-    failed = [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked]
+    failed = [(one.stage, one.item, one.cause) for one in result.failures]
     assert failed == [("images", "3.txt", reason)]
     assert "mean/3.txt" not in result.published
     assert "mean/2.txt" in result.published
@@ -303,9 +303,7 @@ def test_a_change_of_a_file_that_no_source_listed_is_a_failure_of_the_unit(toy: 
     shelf.answers["scaled:3.txt"] = JobOutcome("changed", cause=reason, changed={path: reason})
     result = run_with(toy, shelf)
     assert (result.exit_code, result.warnings) == (3, [])
-    assert [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked] == [
-        ("scaled", "3.txt", reason)
-    ]
+    assert [(one.stage, one.item, one.cause) for one in result.failures] == [("scaled", "3.txt", reason)]
 
 
 def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
@@ -436,7 +434,7 @@ def test_a_stage_takes_the_time_in_which_its_units_are_computed(toy: Toy, monkey
     at(200.0)
     counts.unit_started(entry, "d")
     at(202.0)
-    counts.unit_failed(Failure("scaled", "d", "why"), 2.0)
+    counts.unit_failed(UnitFailed("scaled", "d", "why"), 2.0)
     at(500.0)
     counts.stage_complete(entry)
     (summary,) = result.stages

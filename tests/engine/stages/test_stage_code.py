@@ -25,7 +25,9 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage_code import code_digest, code_texts, library_versions, stage_code
 from pano_mvs.testing.stage_calls import StageCase
-from tests.testing.test_builtin_stages import INPUTS, SETTINGS, SIZES_HW
+from tests.testing.test_builtin_stages import INPUTS, SETTINGS, SIZES_HW, few_views
+
+__all__ = ["few_views"]
 
 PACKAGE = Path(pano_mvs.__file__).parent
 

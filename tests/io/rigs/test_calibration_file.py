@@ -62,6 +62,16 @@ def test_a_rig_survives_its_own_calibration_file(tmp_path: Path) -> None:
         assert pose.translation == pytest.approx(true.translation, abs=1e-12)
 
 
+def test_a_merge_key_takes_what_is_not_stated_from_another_lens(tmp_path: Path) -> None:
+    start, end = TEXT.index("  back:"), TEXT.index("    lens_from_rig:\n")
+    merged = TEXT[:start].replace("front:", "front: &front") + "  back:\n    <<: [*front]\n    focal_px: [9, 9]\n"
+    rig = read_rig(file_of(tmp_path, merged + TEXT[end:]))
+    assert rig.lenses[1].focal_xy == pytest.approx((9, 9))
+    assert rig.lenses[1].distortion == rig.lenses[0].distortion
+    with pytest.raises(InputError, match=r"rig\.yaml:11:14: a merge key \(<<\) takes a mapping or a list of mappings"):
+        read_rig(file_of(tmp_path, TEXT.replace("  back:", "  back: {<<: 3}\n  next:")))
+
+
 def test_an_assumed_distance_stays_one(tmp_path: Path) -> None:
     rig = replace(example_rig(), metric=False)
     again = read_rig(file_of(tmp_path, calibration_text(rig, comments=["from 8 captures"])))
@@ -102,7 +112,7 @@ def test_opencv_counts_pixels_from_the_centre_of_the_first(tmp_path: Path) -> No
         ("[0.01, 0, 0, 0]", "[-0.2, 0, 0, 0]", "5:5: lenses.front: distortion: the distortion is not invertible"),
         ("[0.01, 0, 0, 0]", "['1', 0, 0, 0]", "8:18: lenses.front.distortion.0: Input should be a valid number"),
         ("field_of_view_deg: 190", "field_of_view_deg: 0", "9:24: lenses.front.field_of_view_deg: Input should be"),
-        ("field_of_view_deg", "fov", "9:5: unknown setting 'lenses.front.fov'"),
+        ("focal_px", "focal_xp", "6:5: unknown setting 'lenses.front.focal_xp'. Did you mean 'focal_px'?"),
         ("[1, 0, 0, 0]", "[1, 1, 0, 0]", "10:20: lenses.front.lens_from_rig: the length of the quaternion is not 1"),
         ("[0, 0, 0]}", "[0, 0, 30]}", "10:20: lenses.front.lens_from_rig: translation_m is more than 10 metres"),
         ("[[-1, 0, 0]", "[[1, 0, 0]", "18:7: lenses.back.lens_from_rig: rotation is not a rotation matrix"),

@@ -216,16 +216,6 @@ def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
     assert np.isnan(found.confirmed_shares).all()
 
 
-@pytest.mark.slow
-def test_the_same_bytes_again(matches: Matches) -> None:
-    first, second = (verified(displaced("4.png"), matches) for _ in range(2))
-    assert first.translations.tobytes() == second.translations.tobytes()
-    assert first.confirmed_shares is not None
-    assert second.confirmed_shares is not None
-    assert first.confirmed_shares.tobytes() == second.confirmed_shares.tobytes()
-    assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
-
-
 def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
     model = model_of(displaced("2.png"), pairs_of(*matches))
     before = dict(model.cameras)
