@@ -100,10 +100,15 @@ class Look:
         return self.view.focal_px <= SIDE_PX / 2 / float(np.tan(np.radians(85.0) / 2))
 
     @cached_property
+    def rays(self) -> FloatArray:
+        """The rays (256, 256, 3) of its pixels in the panorama's camera frame."""
+        return self.view.rays()
+
+    @cached_property
     def from_sphere(self) -> Map:
         """The position (x, y) of each pixel in a panorama, (256, 256, 2), as shares of its width and height."""
         size_hw = (SIDE_PX, 2 * SIDE_PX)
-        return np.asarray(pixel_from_ray(self.view.rays(), size_hw) / size_hw[::-1], np.float32)
+        return np.asarray(pixel_from_ray(self.rays, size_hw) / size_hw[::-1], np.float32)
 
     @cached_property
     def pixels(self) -> Map:

@@ -114,7 +114,7 @@ class PackedDescriptors:
             columns ^= 128  # a byte less 128, with a sign
             squares -= 256 * rows.sum(axis=1, dtype=np.int32)
         fours = columns.view(np.int32).reshape(-1, kernels.COLUMNS, columns.shape[1] * columns.itemsize // 4)
-        packed = np.ascontiguousarray(fours.transpose(0, 2, 1)).view(np.int8 if of_bytes else np.int16)
+        packed: NDArray[Any] = np.ascontiguousarray(fours.transpose(0, 2, 1)).view(np.int8 if of_bytes else np.int16)
         shape = (*fours.transpose(0, 2, 1).shape, -1)
         return cls(count, rows, packed.reshape(shape), squares, column_squares)
 
