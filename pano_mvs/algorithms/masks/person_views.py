@@ -21,8 +21,8 @@ SIDE_PX = 256
 Map = NDArray[np.float32]
 
 # By the digest, another file means another code, so that no result of the old one is taken from a cache.
-_SEGMENTATION = ("selfie_segmentation.onnx", "b5c610678298bd36b88394d5521cf7cc41125de25bfb19cebedd016cc70ebb63")
-_POSE = ("pose_landmark_lite.onnx", "7b3f914a1c2bd0ec93cd75542d364320b0ab39b92800adcb7c0b74e327d35c05")
+_SEGMENTATION = ("selfie_segmentation.onnx", "f3cbe4522e152d8912dfac15684014e7d279aa8f47408395bdbc3bd6bf7dfe38")
+_POSE = ("pose_landmark_lite.onnx", "c6a6cc5427f37cd40ecfdc1cc2e63f290850be779b2efb998dd22470776d4646")
 _MODELS = Path(__file__).parent / "models"
 
 
