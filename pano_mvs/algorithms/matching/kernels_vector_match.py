@@ -17,9 +17,9 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import (
-    CPU_FEATURES,
     REGISTER_BYTES,
     element_pointer,
+    features_of_this_machine,
     load_unaligned,
 )
 from pano_mvs.core.kernels import kernel
@@ -37,7 +37,7 @@ COLUMNS: Final = _REGISTERS * LANES
 # Panels whose packed descriptors stay in the first-level cache during one pass over the rows.
 _PANELS_PER_BLOCK: Final = max(1, 128 // COLUMNS)
 _PAIRS = {16: "llvm.x86.sse2.pmadd.wd", 32: "llvm.x86.avx2.pmadd.wd", 64: "llvm.x86.avx512.pmaddw.d.512"}
-HAS_BYTES: Final = REGISTER_BYTES == 64 and "avx512vnni" in CPU_FEATURES
+HAS_BYTES: Final = REGISTER_BYTES == 64 and "avx512vnni" in features_of_this_machine()
 """Whether descriptors may be bytes: the rows without a sign, the columns less 128, with a sign."""
 
 _I16, _I32, _I64 = (ir.IntType(bits) for bits in (16, 32, 64))
