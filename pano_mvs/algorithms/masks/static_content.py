@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -107,7 +107,7 @@ def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
     )
 
 
-def _quantile(planes: Sequence[Plane], share: float) -> Plane:
+def _quantile(planes: Sequence[NDArray[Any]], share: float) -> Plane:
     """Return the quantile of each pixel over some planes, in a sixth of the time of numpy's."""
     ordered, place = np.sort(planes, axis=0), share * (len(planes) - 1)
     below, above = ordered[int(place)], ordered[min(int(place) + 1, len(planes) - 1)]
