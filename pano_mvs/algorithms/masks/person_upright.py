@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ class _Candidate:
     area_deg2: float
     score: float
 
-    @property
+    @cached_property
     def span_deg(self) -> tuple[float, float]:
         """The elevations of its feet and its head."""
         low, high = np.quantile(np.arcsin(np.clip(-self.rays[:, 1], -1, 1)), (0.01, 0.99))

@@ -138,13 +138,16 @@ class SeenPanorama:
         self._full = pad_panorama(reduced, _PAD_PX)
         self._half = pad_panorama(reduced_panorama(reduced, WIDTH // 2), _PAD_PX)
         self.size_hw = (reduced.shape[0], reduced.shape[1])
+        self._latest: tuple[Look, Picture] | None = None
 
     def image(self, look: Look, *, mirrored: bool = False) -> Picture:
-        """Return the image of a view, (256, 256, 3) uint8 RGB."""
-        padded = self._half if look.wide else self._full
-        size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
-        at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
-        image = np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        """Return the image of a view, (256, 256, 3) uint8 RGB; the latest is kept, since both networks look at it."""
+        if self._latest is None or self._latest[0] is not look:
+            padded = self._half if look.wide else self._full
+            size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
+            at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
+            self._latest = look, np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        image = self._latest[1]
         return np.ascontiguousarray(image[:, ::-1]) if mirrored else image
 
     def probability(self, look: Look, *, mirrored: bool = False) -> Map:
