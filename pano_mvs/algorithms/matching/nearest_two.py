@@ -103,10 +103,8 @@ class PackedDescriptors:
 
         count = len(descriptors)
         of_bytes = kernels.HAS_BYTES and descriptors.min() >= 0 and descriptors.max() <= 255
-        rows, columns = (
-            _filled_up(descriptors, multiple, np.dtype(np.uint8 if of_bytes else np.int16))
-            for multiple in (kernels.ROWS, kernels.COLUMNS)
-        )
+        rows = _filled_up(descriptors, kernels.ROWS, np.dtype(np.uint8 if of_bytes else np.int16))
+        columns = _filled_up(rows[:count], kernels.COLUMNS, rows.dtype)
         squares = _squares(rows, count)
         column_squares = np.full(len(columns), _FAR, np.int32)
         column_squares[:count] = squares[:count]
