@@ -174,9 +174,66 @@ class Converter:
                 used |= set(node.input)
         weights = [weight for weight in self.weights if weight.name in used]
         graph = helper.make_graph(kept[::-1], path.stem, [picture], ends, weights)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
+        model = in_blocks(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9))
         onnx.checker.check_model(model, full_check=True)
         path.write_bytes(model.SerializeToString())
+
+
+def in_blocks(model: Any) -> Any:
+    """Return a network in which ONNX Runtime keeps 16 channels of a pixel together, which takes 30 % less time.
+
+    Values of 8 channels get 8 more that are zero. ONNX Runtime merges Clip with a convolution only, so that one without
+    effect follows the additions of large values. A convolution of 3 × 3 pixels to one channel becomes two: one of each
+    channel by itself, and the sum of the channels.
+    """
+    graph = model.graph
+    constants = {weight.name: weight for weight in graph.initializer}
+    stored = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "Cast"}
+    shapes = {
+        value.name: [axis.dim_value for axis in value.type.tensor_type.shape.dim]
+        for value in onnx.shape_inference.infer_shapes(model).graph.value_info
+    }
+    added = {node.output[0] for node in graph.node if node.op_type == "Add"}
+    nodes: list[onnx.NodeProto] = []
+
+    def values(name: str) -> Any:
+        return numpy_helper.to_array(constants[stored.get(name, name)])
+
+    def replace(name: str, array: Any) -> None:
+        constants[stored.get(name, name)].CopyFrom(numpy_helper.from_array(array, stored.get(name, name)))
+
+    def convolution(inputs: list[str], output: str, filters: Any, **attributes: Any) -> None:
+        graph.initializer.append(
+            numpy_helper.from_array(np.asarray(filters, np.float32, order="C"), f"{output}_filters")
+        )
+        nodes.append(helper.make_node("Conv", [inputs[0], f"{output}_filters", *inputs[1:]], [output], **attributes))
+
+    for node in graph.node:
+        if node.op_type == "Resize" and (sizes := values(node.input[3])).tolist()[1] == 8:
+            replace(node.input[3], np.where(sizes == 8, 16, sizes))
+        if node.op_type == "Conv":
+            group = next(attribute for attribute in node.attribute if attribute.name == "group")
+            filters = values(node.input[1])
+            padding = [(0, 8 if size == 8 else 0) for size in filters.shape]
+            filters = np.pad(filters, padding)
+            replace(node.input[1], filters)
+            replace(node.input[2], np.pad(values(node.input[2]), padding[0]))
+            group.i = 16 if group.i == 8 else group.i
+            if len(filters) == 1 and filters.shape[2] == 3:
+                channels, singly = filters.shape[1], f"{node.output[0]}_singly"
+                attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
+                attributes["group"] = channels
+                convolution([node.input[0]], singly, filters.transpose(1, 0, 2, 3), **attributes)
+                convolution([singly, node.input[2]], node.output[0], np.ones((1, channels, 1, 1)))
+                continue
+        if node.op_type == "Clip" and node.input[0] in added and shapes[node.input[0]][2] >= 64:
+            channels = max(16, shapes[node.input[0]][1])
+            convolution([node.input[0]], f"{node.input[0]}_same", np.ones((channels, 1, 1, 1)), group=channels)
+            node.input[0] = f"{node.input[0]}_same"
+        nodes.append(node)
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return model
 
 
 def differences(tflite_file: Path, onnx_file: Path, outputs: dict[str, str]) -> dict[str, float]:

@@ -148,16 +148,21 @@ class Panorama(Record):
             ChangedFileError: if the file or its mask has changed since the run listed it.
             InputError: if one of them is missing, truncated, not an image, or has another size.
         """
-        picture, valid = self.load_unmasked(), self.load_mask()
-        return picture if valid.all() else painted_over(picture, valid)
+        valid = self.load_mask()
+        return self._recent(None if valid.all() else valid)
 
     def load_unmasked(self) -> NDArray[np.uint8]:
         """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop."""
+        return self._recent(None)
+
+    def _recent(self, valid: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+        """Return the image, painted over where it is not valid."""
         data = self.image.read_bytes()
-        key = digest_from_bytes(data), self.size_hw, self.source_size_hw, self.crop_ltwh
+        shown = None if valid is None else digest_from_bytes(valid.tobytes())
+        key = digest_from_bytes(data), self.size_hw, self.source_size_hw, self.crop_ltwh, shown
         picture = _RECENT.get(key)
         if picture is None:
-            picture = self._decoded(data)
+            picture = self._decoded(data) if valid is None else painted_over(self._recent(None), valid)
             _RECENT.put(key, picture)
         return picture
 

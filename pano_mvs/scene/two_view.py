@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -83,7 +84,7 @@ class TwoView(Record):
             return self.matches_idx
         return np.concatenate([self.matches_idx, self.unverified_idx])
 
-    @property
+    @cached_property
     def residual_deg(self) -> float:
         """Median residual of the verified matches; 0 if there are none."""
         return float(np.rad2deg(np.median(self.residuals_rad))) if len(self) else 0.0

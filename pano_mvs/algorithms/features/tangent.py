@@ -158,7 +158,7 @@ def _extract(
     tiles = tangent_tiles(size_hw)
     detected = [detect(sample_tile(gray, idx), owned_pixels(size_hw, idx)) for idx in range(len(tiles))]
     found = [
-        _owned(_unmasked(f, valid, t, clearance=clearance), t, i)
+        _owned(_unmasked(f, valid, i, clearance=clearance), t, i)
         for i, (f, t) in enumerate(zip(detected, tiles, strict=True))
     ]
     bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
@@ -189,15 +189,18 @@ def _check(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
         )
 
 
-def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, *, clearance: float) -> _Found:
+def _unmasked(found: _Found, valid: NDArray[np.uint8], tile_idx: int, *, clearance: float) -> _Found:
     """Drop key points that are masked, or closer to the mask than `clearance` sizes; `valid` is 255 or 0."""
     if valid.all() or not len(found.scores):
         return found
-    valid_in_tile = (sample_view(valid, tile, interpolation=cv2.INTER_LINEAR) == 255).astype(np.uint8)
+    valid_in_tile = (sample_tile(valid, tile_idx, interpolation=cv2.INTER_LINEAR) == 255).astype(np.uint8)
+    if valid_in_tile.all():
+        return found
     # The border of the tile does not count, only the distance to masked pixels.
     distance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     x, y = np.floor(found.pixels_px).astype(np.intp).T
-    distance_px = distance_px[np.clip(y, 0, tile.size_hw[0] - 1), np.clip(x, 0, tile.size_hw[1] - 1)]
+    height, width = distance_px.shape
+    distance_px = distance_px[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     return found[distance_px > 1.0 + clearance * found.sizes_px]
 
 
@@ -250,13 +253,15 @@ _PAD_PX = 4
 _MAX_WIDTH = 2560  # maximum width of panoramas whose maps are cached: 78 MB, 8 bytes a pixel plus one for the mask
 
 
-def sample_tile(panorama: NDArray[np.uint8], tile_idx: int) -> NDArray[np.uint8]:
+def sample_tile(
+    panorama: NDArray[np.uint8], tile_idx: int, *, interpolation: int = cv2.INTER_CUBIC
+) -> NDArray[np.uint8]:
     """Return the result of `sample_view` for a tangent tile of a panorama (H, W)."""
     size_hw = (panorama.shape[0], panorama.shape[1])
     if size_hw[1] > _MAX_WIDTH:
-        return sample_view(panorama, tangent_tiles(size_hw)[tile_idx])
+        return sample_view(panorama, tangent_tiles(size_hw)[tile_idx], interpolation=interpolation)
     padded = pad_panorama(panorama, min(_PAD_PX, *size_hw))
-    return np.asarray(cv2.remap(padded, *_kept_map(size_hw, tile_idx), cv2.INTER_CUBIC), np.uint8)
+    return np.asarray(cv2.remap(padded, *_kept_map(size_hw, tile_idx), interpolation), np.uint8)
 
 
 def owned_pixels(size_hw: tuple[int, int], tile_idx: int) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ class _Candidate:
     area_deg2: float
     score: float
 
-    @property
+    @cached_property
     def span_deg(self) -> tuple[float, float]:
         """The elevations of its feet and its head."""
         low, high = np.quantile(np.arcsin(np.clip(-self.rays[:, 1], -1, 1)), (0.01, 0.99))
@@ -120,20 +120,32 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
     probability = _probability_in(candidate, seen.probability(first), first)
     if probability < 0.65:
         return None
-    presences, outlines = [], []
-    for roll_deg, mirrored, wider in ((0.0, False, 1.0), (12.0, True, 1.0), (-12.0, False, 1.2)):
-        view = _look_at(candidate, roll_deg, wider)
+    missed, found = 0, []
+    for view, mirrored in (
+        (first, False),
+        (_look_at(candidate, 12.0), True),
+        (_look_at(candidate, -12.0, 1.2), False),
+    ):
         presence, outline = seen.middle(view, mirrored=mirrored)
-        presences.append(presence)
-        outlines.append(view.on_map(outline))
-    # A person is detected in all views but one, or in all but one of those half a height lower, which show somebody who
-    # is seen down to the waist.
-    if sum(presence < 0.5 for presence in presences) > 1:
-        lower = [_look_at(candidate, wider=wider, lower=0.5) for wider in (1.33, 1.67)]
-        missed = [seen.middle(view, mirrored=mirrored)[0] < 0.5 for view in lower for mirrored in (False, True)]
-        if probability < 0.75 or sum(missed) > 1:
+        found.append((view, outline))
+        missed += presence < 0.5
+        # A person is detected in all views but one, or in all but one of those half a height lower, which show somebody
+        # who is seen down to the waist.
+        if presence < 0.5 and missed == 2 and (probability < 0.75 or not _seen_lower(seen, candidate)):
             return None
-    return np.asarray(np.mean(outlines, axis=0), np.float32)
+    return np.asarray(np.mean([view.on_map(outline) for view, outline in found], axis=0), np.float32)
+
+
+def _seen_lower(seen: SeenPanorama, candidate: _Candidate) -> bool:
+    """Return whether all but one of four views half a height lower show a person."""
+    missed = 0
+    for wider in (1.33, 1.67):
+        view = _look_at(candidate, wider=wider, lower=0.5)
+        for mirrored in (False, True):
+            missed += seen.middle(view, mirrored=mirrored)[0] < 0.5
+            if missed > 1:
+                return False
+    return True
 
 
 def _look_at(candidate: _Candidate, roll_deg: float = 0.0, wider: float = 1.0, *, lower: float = 0.0) -> Look:
@@ -171,9 +183,8 @@ def _same(first: _Candidate, second: _Candidate) -> bool:
 
 def _geometry(view: Look) -> tuple[FloatArray, FloatArray]:
     """Return the rays (256, 256, 3) and the solid angles (256, 256) of a stereographic view's pixels."""
-    rays = view.view.rays()
-    along = rays @ view.view.view_from_cam[2]
-    return rays, ((1 + along) / 2 / view.view.focal_px) ** 2
+    along = view.rays @ view.view.view_from_cam[2]
+    return view.rays, ((1 + along) / 2 / view.view.focal_px) ** 2
 
 
 @cache

@@ -21,8 +21,8 @@ SIDE_PX = 256
 Map = NDArray[np.float32]
 
 # By the digest, another file means another code, so that no result of the old one is taken from a cache.
-_SEGMENTATION = ("selfie_segmentation.onnx", "b5c610678298bd36b88394d5521cf7cc41125de25bfb19cebedd016cc70ebb63")
-_POSE = ("pose_landmark_lite.onnx", "7b3f914a1c2bd0ec93cd75542d364320b0ab39b92800adcb7c0b74e327d35c05")
+_SEGMENTATION = ("selfie_segmentation.onnx", "f3cbe4522e152d8912dfac15684014e7d279aa8f47408395bdbc3bd6bf7dfe38")
+_POSE = ("pose_landmark_lite.onnx", "c6a6cc5427f37cd40ecfdc1cc2e63f290850be779b2efb998dd22470776d4646")
 _MODELS = Path(__file__).parent / "models"
 
 
@@ -100,10 +100,15 @@ class Look:
         return self.view.focal_px <= SIDE_PX / 2 / float(np.tan(np.radians(85.0) / 2))
 
     @cached_property
+    def rays(self) -> FloatArray:
+        """The rays (256, 256, 3) of its pixels in the panorama's camera frame."""
+        return self.view.rays()
+
+    @cached_property
     def from_sphere(self) -> Map:
         """The position (x, y) of each pixel in a panorama, (256, 256, 2), as shares of its width and height."""
         size_hw = (SIDE_PX, 2 * SIDE_PX)
-        return np.asarray(pixel_from_ray(self.view.rays(), size_hw) / size_hw[::-1], np.float32)
+        return np.asarray(pixel_from_ray(self.rays, size_hw) / size_hw[::-1], np.float32)
 
     @cached_property
     def pixels(self) -> Map:
@@ -133,13 +138,16 @@ class SeenPanorama:
         self._full = pad_panorama(reduced, _PAD_PX)
         self._half = pad_panorama(reduced_panorama(reduced, WIDTH // 2), _PAD_PX)
         self.size_hw = (reduced.shape[0], reduced.shape[1])
+        self._latest: tuple[Look, Picture] | None = None
 
     def image(self, look: Look, *, mirrored: bool = False) -> Picture:
-        """Return the image of a view, (256, 256, 3) uint8 RGB."""
-        padded = self._half if look.wide else self._full
-        size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
-        at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
-        image = np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        """Return the image of a view, (256, 256, 3) uint8 RGB; the latest is kept, since both networks look at it."""
+        if self._latest is None or self._latest[0] is not look:
+            padded = self._half if look.wide else self._full
+            size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
+            at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
+            self._latest = look, np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        image = self._latest[1]
         return np.ascontiguousarray(image[:, ::-1]) if mirrored else image
 
     def probability(self, look: Look, *, mirrored: bool = False) -> Map:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -86,7 +86,7 @@ def color_difference(pictures: Sequence[Picture], gains: NDArray[np.float64]) ->
     """
     smooth = [mean_around(picture) * gain.astype(np.float32) for picture, gain in zip(pictures, gains, strict=True)]
     apart = [largest_channel(np.abs(smooth[i] - smooth[j])) for i, j in evenly_spread_pairs(len(pictures))]
-    return np.asarray(np.quantile(apart, 1 - _DISAGREEING, axis=0), np.float32)
+    return _quantile(apart, 1 - _DISAGREEING)
 
 
 def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
@@ -98,13 +98,20 @@ def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
         sharper.append(here - _best_around(compared[first], compared[second], step=1))
         still.append(np.maximum(here, _best_around(compared[first], compared[second], step=3)))
     inner = (slice(_PAD, -_PAD), slice(_PAD, -_PAD))
-    variance = np.median([variance for _, _, variance in compared], axis=0)
+    variance = _quantile([variance for _, _, variance in compared], 0.5)
     return FrameAgreement(
         contrast=np.sqrt(np.maximum(variance, 0)).astype(np.float32)[inner],
-        agreement=np.quantile(same, _DISAGREEING, axis=0).astype(np.float32)[inner],
-        sharpness=np.quantile(sharper, _DISAGREEING, axis=0).astype(np.float32)[inner],
-        still=np.quantile(still, 0.75, axis=0).astype(np.float32)[inner],
+        agreement=_quantile(same, _DISAGREEING)[inner],
+        sharpness=_quantile(sharper, _DISAGREEING)[inner],
+        still=_quantile(still, 0.75)[inner],
     )
+
+
+def _quantile(planes: Sequence[NDArray[Any]], share: float) -> Plane:
+    """Return the quantile of each pixel over some planes, in a sixth of the time of numpy's."""
+    ordered, place = np.sort(planes, axis=0), share * (len(planes) - 1)
+    below, above = ordered[int(place)], ordered[min(int(place) + 1, len(planes) - 1)]
+    return np.asarray(below + (above - below) * np.float32(place % 1), np.float32)
 
 
 def _windows(picture: Picture) -> _Compared:
@@ -235,7 +242,7 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     alike = color_difference(pictures, _gains(pictures, core)) <= 8.0 + 0.05 * brightness
     closed = ~dilated(~dilated(core, _CLOSING_PX), _CLOSING_PX) | core
     # Beside which three fifths of the views have an edge.
-    edges = np.quantile([contrast_around(picture, 1) for picture in pictures], 0.4, axis=0) >= 12
+    edges = _quantile([contrast_around(picture, 1) for picture in pictures], 0.4) >= 12
     outline = closed | edges
     parts = opened_areas((alike | plain) & ~closed, 1)
     labels, weights = area_labels(parts), pixel_weights(core.shape)

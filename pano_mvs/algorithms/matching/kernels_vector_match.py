@@ -1,7 +1,8 @@
 """Compiled to vector instructions: scalar products of descriptors of small whole numbers, and the nearest two of each.
 
-A product of two 16-bit numbers costs half of what a float's does (PMADDWD multiplies pairs and adds them up), all
-sums are exact, and the products are compared in the registers.
+A product of two 16-bit numbers costs half of what a float's does (PMADDWD multiplies pairs and adds them up), and one
+of two bytes half of that again (VPDPBUSD, of bytes without and with a sign). All sums are exact, and the products are
+compared in the registers.
 """
 
 from __future__ import annotations
@@ -15,7 +16,12 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import (
+    REGISTER_BYTES,
+    element_pointer,
+    features_of_this_machine,
+    load_unaligned,
+)
 from pano_mvs.core.kernels import kernel
 
 LANES: Final = REGISTER_BYTES // 4
@@ -31,6 +37,8 @@ COLUMNS: Final = _REGISTERS * LANES
 # Panels whose packed descriptors stay in the first-level cache during one pass over the rows.
 _PANELS_PER_BLOCK: Final = max(1, 128 // COLUMNS)
 _PAIRS = {16: "llvm.x86.sse2.pmadd.wd", 32: "llvm.x86.avx2.pmadd.wd", 64: "llvm.x86.avx512.pmaddw.d.512"}
+HAS_BYTES: Final = REGISTER_BYTES == 64 and "avx512vnni" in features_of_this_machine()
+"""Whether descriptors may be bytes: the rows without a sign, the columns less 128, with a sign."""
 
 _I16, _I32, _I64 = (ir.IntType(bits) for bits in (16, 32, 64))
 _REGISTER = ir.VectorType(_I32, LANES)
@@ -46,24 +54,33 @@ def _larger(builder: Any, first: Any, second: Any) -> Any:
     return builder.select(builder.icmp_signed(">", first, second), first, second)
 
 
-def _products(builder: Any, steps: Any, row_places: list[Any], panel: Any) -> list[list[Any]]:
-    """Emit the loop over pairs of components; return ROWS × _REGISTERS registers of scalar products."""
-    pairs = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(_REGISTER, [_WORDS, _WORDS]), _PAIRS[REGISTER_BYTES]
-    )
+def _added(builder: Any, total: Any, row: Any, column: Any) -> Any:
+    """Add the products of the components in two registers to a sum: pairs of words, or fours of bytes."""
+    if row.type == _REGISTER:
+        kind = ir.FunctionType(_REGISTER, [_REGISTER] * 3)
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.vpdpbusd.512"), [total, row, column]
+        )
+    kind = ir.FunctionType(_REGISTER, [_WORDS, _WORDS])
+    pairs = cgutils.get_or_insert_function(builder.module, kind, _PAIRS[REGISTER_BYTES])
+    return builder.add(total, builder.call(pairs, [row, column]))
+
+
+def _products(builder: Any, steps: Any, row_places: list[Any], panel: Any, *, of: ir.VectorType) -> list[list[Any]]:
+    """Emit the loop over registers of components, `of` a type; return ROWS × _REGISTERS registers of products."""
     zero = ir.Constant(_REGISTER, [0] * LANES)
     sums = [[cgutils.alloca_once_value(builder, zero) for _ in range(_REGISTERS)] for _ in range(ROWS)]
     with cgutils.for_range(builder, steps) as loop:
         columns = []
         for register in range(_REGISTERS):
             at = builder.add(builder.mul(loop.index, ir.Constant(_I64, _REGISTERS)), ir.Constant(_I64, register))
-            columns.append(builder.bitcast(load_unaligned(builder, builder.gep(panel, [at])), _WORDS))
+            columns.append(builder.bitcast(load_unaligned(builder, builder.gep(panel, [at])), of))
         for row, place in enumerate(row_places):
-            pair = load_unaligned(builder, builder.gep(place, [loop.index]))
-            both = builder.bitcast(_everywhere(builder, pair), _WORDS)
+            few = load_unaligned(builder, builder.gep(place, [loop.index]))
+            everywhere = builder.bitcast(_everywhere(builder, few), of)
             for register, column in enumerate(columns):
-                product = builder.call(pairs, [both, column])
-                builder.store(builder.add(builder.load(sums[row][register]), product), sums[row][register])
+                total = _added(builder, builder.load(sums[row][register]), everywhere, column)
+                builder.store(total, sums[row][register])
     return [[builder.load(total) for total in row] for row in sums]
 
 
@@ -95,15 +112,15 @@ def _match_tile(
 
     Args:
         typingctx: the typing context of numba.
-        rows: (n, 2 steps) int16.
-        packed: (panels, steps, COLUMNS, 2) int16.
-        row_squares: (n,) int32 squared lengths.
+        rows: (n, 2 steps) int16, or (n, 4 steps) uint8.
+        packed: (panels, steps, COLUMNS, 2) int16, or (panels, steps, COLUMNS, 4) int8.
+        row_squares: (n,) int32 squared lengths; of bytes, less 256 Σa, as 2 a·b is 2 a·(b − 128) + 256 Σa.
         column_squares: (m,) int32.
         state: (n, 3, LANES) int32: greatest 2 a·b − |b|², the second greatest, the column of the greatest; updated.
         column_best: (m,) int32 greatest 2 a·b − |a|²; updated.
         row: position of the first row.
         panel: position of the panel.
-        steps: number of pairs of components.
+        steps: number of pairs of words, or of fours of bytes, in a row.
     """
     place = types.uint64
     signature = types.void(rows, packed, row_squares, column_squares, state, column_best, place, place, place)
@@ -117,10 +134,12 @@ def _match_tile(
 
         first_row, panel, steps = args[6:]
         numbers = [builder.add(first_row, number(k)) for k in range(ROWS)]
-        twice = builder.shl(steps, number(1))
-        row_places = [pointer(0, builder.mul(at, twice), _I32) for at in numbers]
-        packed_at = builder.mul(builder.mul(panel, twice), number(COLUMNS))
-        products = _products(builder, steps, row_places, pointer(1, packed_at, _REGISTER))
+        of_bytes = sig.args[0].dtype == types.uint8
+        size = builder.mul(steps, number(4 if of_bytes else 2))
+        row_places = [pointer(0, builder.mul(at, size), _I32) for at in numbers]
+        packed_at = builder.mul(builder.mul(panel, size), number(COLUMNS))
+        panel_place = pointer(1, packed_at, _REGISTER)
+        products = _products(builder, steps, row_places, panel_place, of=_REGISTER if of_bytes else _WORDS)
         doubled = [[builder.shl(p, ir.Constant(_REGISTER, [1] * LANES)) for p in row] for row in products]
         first_column = builder.mul(panel, number(COLUMNS))
         columns = [builder.add(first_column, number(k * LANES)) for k in range(_REGISTERS)]
@@ -146,8 +165,8 @@ def _match_tile(
 
 @kernel
 def compare_all(
-    rows: NDArray[np.int16],
-    packed: NDArray[np.int16],
+    rows: NDArray[np.int16] | NDArray[np.uint8],
+    packed: NDArray[np.int16] | NDArray[np.int8],
     row_squares: NDArray[np.int32],
     column_squares: NDArray[np.int32],
     state: NDArray[np.int32],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,8 @@ def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> Near
     return NearestTwo(nearest, -2 * best, -2 * runner_up, -2 * best_back)
 
 
-_START = -(1 << 30)
-"""Farther away than the padding of the last block, which is farther than sums of products, below 3 × 2^27."""
+_FAR = 1 << 29
+"""Squared length of what pads the last block, larger than sums of products, below 3 × 2^27."""
 
 
 def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
@@ -63,8 +64,10 @@ def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
     if not HAS_VECTOR:
         return False
     # The comparison is also false for NaN.
-    greatest = float(np.abs(descriptors).max(initial=0))
-    return greatest**2 * descriptors.shape[1] <= 1 << 27 and np.array_equal(descriptors, np.rint(descriptors))
+    greatest = max(float(descriptors.max(initial=0)), -float(descriptors.min(initial=0)))
+    if not greatest**2 * descriptors.shape[1] <= 1 << 27:
+        return False
+    return np.array_equal(descriptors, descriptors.astype(np.int16))
 
 
 class Comparable:
@@ -77,8 +80,9 @@ class Comparable:
 
     def nearest_two(self, other: Comparable) -> NearestTwo:
         """Return the two nearest neighbours of each among M ≥ 2 others of the same length."""
-        if self._packed is not None and other._packed is not None:
-            return nearest_two_packed(self._packed, other._packed)
+        first, second = self._packed, other._packed
+        if first is not None and second is not None and first.rows.dtype == second.rows.dtype:
+            return nearest_two_packed(first, second)
         return nearest_two(self.descriptors, other.descriptors)
 
 
@@ -87,28 +91,38 @@ class PackedDescriptors:
     """Descriptors in the memory layout of the compiled comparison, to be compared with many others."""
 
     count: int  # number of descriptors, N
-    rows: NDArray[np.int16]  # (padded N, padded D) int16
-    columns: NDArray[np.int16]  # the same in blocks of columns, with pairs of components together
-    row_squares: NDArray[np.int32]  # (padded N,) int32 squared lengths
-    column_squares: NDArray[np.int32]  # likewise, for the padded number of columns
+    rows: NDArray[np.int16] | NDArray[np.uint8]  # (padded N, padded D)
+    columns: NDArray[np.int16] | NDArray[np.int8]  # likewise in blocks of columns, with 4 bytes of each together
+    row_squares: NDArray[np.int32]  # (padded N,) int32 squared lengths, less what the products of bytes lack
+    column_squares: NDArray[np.int32]  # (padded number of columns,) int32 squared lengths
 
     @classmethod
     def of(cls, descriptors: NDArray[np.generic]) -> PackedDescriptors:
         """Return descriptors (N, D) packed, for which `can_compare_as_integers` is true."""
         from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
-        rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
-        packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
         count = len(descriptors)
-        return cls(count, rows, np.ascontiguousarray(packed), _squares(rows, count), _squares(columns, count))
+        of_bytes = kernels.HAS_BYTES and descriptors.min() >= 0 and descriptors.max() <= 255
+        rows = _filled_up(descriptors, kernels.ROWS, np.dtype(np.uint8 if of_bytes else np.int16))
+        columns = _filled_up(rows[:count], kernels.COLUMNS, rows.dtype)
+        squares = _squares(rows, count)
+        column_squares = np.full(len(columns), _FAR, np.int32)
+        column_squares[:count] = squares[:count]
+        if of_bytes:
+            columns ^= 128  # a byte less 128, with a sign
+            squares -= 256 * rows.sum(axis=1, dtype=np.int32)
+        fours = columns.view(np.int32).reshape(-1, kernels.COLUMNS, columns.shape[1] * columns.itemsize // 4)
+        packed: NDArray[Any] = np.ascontiguousarray(fours.transpose(0, 2, 1)).view(np.int8 if of_bytes else np.int16)
+        shape = (*fours.transpose(0, 2, 1).shape, -1)
+        return cls(count, rows, packed.reshape(shape), squares, column_squares)
 
 
 def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
     """Return the result of `nearest_two` without rounding; `second` has M ≥ 2 descriptors of the same length."""
     from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
-    state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)
-    column_best = np.full(len(second.column_squares), _START, np.int32)
+    state = np.full((len(first.rows), 3, kernels.LANES), -2 * _FAR, np.int32)
+    column_best = np.full(len(second.column_squares), -2 * _FAR, np.int32)
     kernels.compare_all(first.rows, second.columns, first.row_squares, second.column_squares, state, column_best)
     best, second_best, nearest = _over_lanes(state[: first.count])
     squares = first.row_squares[: first.count]
@@ -120,17 +134,18 @@ def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> N
     )
 
 
-def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.int16]:
-    """Return descriptors as 16-bit numbers, zero-padded to a multiple of rows and an even number of columns."""
+def _filled_up(descriptors: NDArray[np.generic], multiple: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return descriptors as whole numbers, zero-padded to a multiple of rows and of four bytes in a row."""
     count, size = descriptors.shape
-    filled = np.zeros((-(-count // multiple) * multiple, size + size % 2), np.int16)
+    step = 4 // dtype.itemsize
+    filled = np.zeros((-(-count // multiple) * multiple, -(-size // step) * step), dtype)
     filled[:count, :size] = descriptors
     return filled
 
 
-def _squares(descriptors: NDArray[np.int16], count: int) -> NDArray[np.int32]:
+def _squares(descriptors: NDArray[Any], count: int) -> NDArray[np.int32]:
     """Return the squared lengths; those after the first `count` are larger than any distance."""
-    squares = np.full(len(descriptors), 1 << 29, np.int32)
+    squares = np.full(len(descriptors), _FAR, np.int32)
     squares[:count] = np.einsum("nd,nd->n", descriptors[:count], descriptors[:count], dtype=np.int32)
     return squares
 

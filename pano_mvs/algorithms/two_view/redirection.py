@@ -110,8 +110,8 @@ def upright_poses(
     # Allows for the tilt of the cameras and for the steps between headings.
     wide_rad = max(float(np.deg2rad(0.6)), threshold_rad)
     rough: list[tuple[float, Rigid3]] = []
-    for heading in np.deg2rad(np.arange(0.0, 360.0, 2.0)):
-        rotation = rotation_from_rotvec(np.array([0.0, heading, 0.0]))
+    headings = np.deg2rad(np.arange(0.0, 360.0, 2.0))
+    for rotation in rotation_from_rotvec(np.outer(headings, [0.0, 1.0, 0.0])):
         directions, costs = direction_candidates(rotation, first, second, rng=rng, threshold_rad=wide_rad, count=100)
         if len(directions):
             best = int(np.argmin(costs))

@@ -115,8 +115,9 @@ def verify_pair(
     poses = _distinct(pair, tried[0].pose, most=max_alternatives)
     costs = facing_costs(poses, p, q, threshold_rad=pair.threshold_rad)
     # Their significance is that of the pair: each was found to be more than chance.
-    ranked = [replace(tried[0], pose=poses[idx]) for idx in np.argsort(costs, kind="stable")]
-    views = [view for evidence in ranked if (view := pair.judged(evidence))]
+    ranked = [poses[idx] for idx in np.argsort(costs, kind="stable")]
+    judged = (best if pose is tried[0].pose else pair.judged(replace(tried[0], pose=pose)) for pose in ranked)
+    views = [view for view in judged if view]
     return views[0].with_alternatives(sorted(views[1:], key=len, reverse=True)) if views else best
 
 
@@ -177,10 +178,10 @@ def pose_near(
     if not enough:
         return None
     evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
-    if not np.isfinite(evidence.log10_false_alarms) or pair.why_open(evidence):
-        return None
     alarms = evidence.log10_false_alarms
-    return near, alarms, weight_of_pair(first, second, pair.view(evidence), log10_false_alarms=alarms)
+    if not np.isfinite(alarms) or pair.why_open(view := pair.view(evidence)):
+        return None
+    return near, alarms, weight_of_pair(first, second, view, log10_false_alarms=alarms)
 
 
 def weight_of_pair(first: Features, second: Features, view: TwoView, *, log10_false_alarms: float) -> float:
@@ -315,9 +316,8 @@ class _Pair:
             unverified_idx=self.matches_idx[~kept],
         )
 
-    def why_open(self, evidence: _Evidence) -> str:
+    def why_open(self, view: TwoView) -> str:
         """Return a reason if the matches that agree with a pose do not determine it; "" otherwise."""
-        view = self.view(evidence)
         rays = self.first.bearings[view.matches_idx[:, 0]], self.second.bearings[view.matches_idx[:, 1]]
         parallax = angle_between(rays[0] @ view.rotation.T, rays[1])
         moved = int((parallax > 4.0 * self.threshold_rad).sum())  # by more than the noise
@@ -342,8 +342,9 @@ class _Pair:
             if evidence.log10_false_alarms <= MAX_LOG10_FALSE_ALARMS:
                 chance = "but the images may show two things that look alike"
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
-        reason = self.why_open(evidence)
-        return self.failed(reason) if reason else self.view(evidence)
+        view = self.view(evidence)
+        reason = self.why_open(view)
+        return self.failed(reason) if reason else view
 
 
 def _upright(pair: _Pair) -> list[_Evidence]:
@@ -389,7 +390,7 @@ def _most_probable(pair: _Pair, found: list[_Evidence], *, most: int, reason: st
             pair.evidence(pose, sample=minimal.sample, models=minimal.models)
             for pose in _distinct(pair, best.pose, most=most)
         ]
-    known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not pair.why_open(one)]
+    known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not pair.why_open(pair.view(one))]
     if not known:
         return pair.judged(found[0]) if found else pair.failed(reason)
     ranked: list[_Evidence] = []

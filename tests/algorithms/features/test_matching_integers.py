@@ -68,6 +68,16 @@ def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit() -> None:
     np.testing.assert_array_equal(found.squared_back, exact.min(axis=0).astype(np.float32))
 
 
+@pytest.mark.kernel("matching.kernels_vector_match")
+@needs_vector
+@pytest.mark.parametrize("low", [0, -5])
+def test_bytes_and_larger_numbers_are_compared_with_each_other(low: int) -> None:
+    rng = np.random.default_rng(11)
+    first, second = draw(rng, 70, 128), draw(rng, 90, 128, low=low, high=300)
+    assert_same(Comparable(first).nearest_two(Comparable(second)), nearest_two(first, second))
+    assert_same(Comparable(second).nearest_two(Comparable(first)), nearest_two(second, first))
+
+
 @pytest.mark.parametrize("wrong", [0.5, np.nan, np.inf, 2000.0, 1e30])
 def test_other_numbers_are_left_to_the_plain_products(wrong: float) -> None:
     descriptors = np.full((3, 128), 7, np.float32)

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.core.kernels import kernel
+from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import angle_between
 
 
-@kernel
+@inlined
 def _derivatives(
     rotations: FloatArray,
     centers: FloatArray,
@@ -69,7 +69,7 @@ def _invert_symmetric(matrix: FloatArray, inverses: FloatArray, p: int) -> None:
     inverses[p, 1, 0], inverses[p, 2, 0], inverses[p, 2, 1] = i01 * scale, i02 * scale, i12 * scale
 
 
-@kernel
+@inlined
 def _add_observation(
     rows: FloatArray,
     t: int,

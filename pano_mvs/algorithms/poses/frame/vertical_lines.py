@@ -15,11 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
-from pano_mvs.algorithms.faces.render import face_image, face_mask
+from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.panoramas import reduced_panorama
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import UP, PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
+from pano_mvs.geometry import (
+    UP,
+    PinholeView,
+    pad_panorama,
+    rotation_from_rotvec,
+    rotation_from_two_vectors,
+    spiral_rays,
+)
 
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
@@ -172,26 +180,28 @@ def _in_panorama(
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return normals in the camera frame (M, 3) and lengths (M,) of the segments in each view, by its rotation."""
     small = reduced_panorama(image, 4 * 512)
-    mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+    mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    # Bicubic interpolation takes two pixels on each side, and a pixel of a view covers more than one of the panorama.
+    clear = cv2.erode(pad_panorama(mask, 3), np.ones((7, 7), np.uint8))[3:-3, 3:-3] > 0
     size = max(16, small.shape[1] // 4)
     focal = size / 2 / np.tan(np.deg2rad(45.0))
     views = []
     for side in sides:
         view = PinholeView(side, float(focal), np.array([size / 2, size / 2]), (size, size))
-        views.append(_in_view(face_image(small, view), face_mask(mask, view), view))
+        views.append(_in_view(face_image(small, view), clear, view))
     return views
 
 
-def _in_view(image: NDArray[np.uint8], valid: NDArray[np.bool_], view: PinholeView) -> tuple[FloatArray, FloatArray]:
+def _in_view(image: NDArray[np.uint8], clear: NDArray[np.bool_], view: PinholeView) -> tuple[FloatArray, FloatArray]:
     # OpenCV's pixels have their centres at whole numbers, ours at halves.
     found = cv2.createLineSegmentDetector().detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[0]
     ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64) + 0.5
     # Segments shorter than this share of a face do not point anywhere exactly.
     ends = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= 0.06 * view.size_hw[0]]
-    if len(ends) and not valid.all():
+    if len(ends) and not clear.all():
         along = ends[:, :1] + np.linspace(0, 1, 9)[None, :, None] * (ends[:, 1:] - ends[:, :1])
-        columns, rows = np.clip(along.astype(int), 0, view.size_hw[0] - 1).transpose(2, 0, 1)
-        ends = ends[valid[rows, columns].all(axis=1)]
+        size_hw = (clear.shape[0], clear.shape[1])
+        ends = ends[clear[pixels_containing(view.bearings_from_pixels(along), size_hw)].all(axis=1)]
     rays = view.bearings_from_pixels(ends)
     normals = np.cross(rays[:, 0], rays[:, 1])
     sines = np.linalg.norm(normals, axis=1, keepdims=True)

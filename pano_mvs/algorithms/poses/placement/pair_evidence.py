@@ -49,7 +49,7 @@ def estimate_scale(
         best = np.flatnonzero(neighbours == neighbours.max())
         return float(ordered[best[len(best) // 2]])
     logs = np.log(ratios)
-    center = float(np.median(logs))
+    center = _median(logs)
     return float(np.exp(center if estimator == "log_median" else _cauchy_center(logs, weights, center)))
 
 

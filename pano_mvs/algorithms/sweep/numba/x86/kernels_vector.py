@@ -20,19 +20,21 @@ from numba.extending import intrinsic
 from pano_mvs.algorithms.sweep.kernels_constants import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
 
 
-def _lanes_of_this_machine() -> int:
-    """Return how many 16-byte lanes its widest registers have that can be shuffled by bytes; 0 if they cannot.
+def features_of_this_machine() -> frozenset[str]:
+    """Return the names of its instructions, as LLVM names them, for which numba compiles.
 
-    numba compiles for the instructions in NUMBA_CPU_FEATURES if that is set, and for none beyond the baseline if
-    NUMBA_CPU_NAME is generic. Any other instruction would end the process when it is compiled.
+    Those are the ones in NUMBA_CPU_FEATURES if that is set, and none beyond the baseline if NUMBA_CPU_NAME is generic.
+    Any other instruction would end the process when it is compiled.
     """
-    features: dict[str, bool] = llvm.get_host_cpu_features()
     if numba.config.CPU_FEATURES is not None:
-        features = dict.fromkeys(re.findall(r"\+([^,\s]+)", numba.config.CPU_FEATURES), True)
-    for lanes, needed in ((4, "avx512bw"), (2, "avx2"), (1, "ssse3")):
-        if features.get(needed, False):
-            return lanes
-    return 0
+        return frozenset(re.findall(r"\+([^,\s]+)", numba.config.CPU_FEATURES))
+    return frozenset(name for name, present in llvm.get_host_cpu_features().items() if present)
+
+
+def _lanes_of_this_machine() -> int:
+    """Return how many 16-byte lanes its widest registers have that can be shuffled by bytes; 0 if they cannot."""
+    features = features_of_this_machine()
+    return next((lanes for lanes, needed in ((4, "avx512bw"), (2, "avx2"), (1, "ssse3")) if needed in features), 0)
 
 
 _LANES = _lanes_of_this_machine()
