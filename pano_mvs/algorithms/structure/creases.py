@@ -4,7 +4,8 @@ Plain walls show nothing to match, but their lower and upper edges do. In every 
 predicted crease, at many azimuths. Each upright plane is first moved to where differences of colour across its creases
 have most in common: they are added as vectors, so that texture beside the crease cancels out and the crease remains.
 Then the places of short pieces of all creases of all views are measured, and all planes are adjusted to them together,
-each held by its ranges according to their uncertainty.
+each held by its ranges according to their uncertainty. Views at different distances from a wall locate the edge that
+they see, which need not be where the planes meet.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ _LOSS, _TAIL = 0.025, 2.0
 _SHIFTS, _TURNS_RAD = np.linspace(-0.06, 0.06, 25), np.radians(np.linspace(-1, 1, 5))
 # Pieces of creases have at most as many samples. In three rendered captures with true planes, they scattered by 0.02 to
 # 0.05° around what the creases of two planes have in common, and this was 0.02° (hall) to 0.3° (skirting boards of a
-# small room) from the truth. The last scale of the search, from coarse to fine, is that of these common errors; pieces
-# are sought within five times a scale.
-_PIECE, _PIECE_RAD, _SCALES_RAD = 12, np.radians(0.05), np.radians([0.2, 0.14, 0.1, 0.08, 0.06, 0.06])
+# small room) from the truth. The last scale of the search, from coarse to fine, is that of the errors that pieces of one
+# view have in common; pieces are sought within five times a scale.
+_PIECE, _PIECE_RAD, _SCALES_RAD = 12, np.radians(0.05), np.radians([0.2, 0.14, 0.1, 0.08, 0.08, 0.08])
 
 
 def placed_by_creases(
@@ -176,7 +177,7 @@ class _Placement:
 
         Returns:
             Differences in radians (P,), contrasts in grey levels (P,), derivatives of the dip by shift, turn and the
-            height of the level plane (P, 3), and that plane (P,).
+            height of the level plane (P, 3), that plane (P,), and the number of the crease of one view (P,).
         """
         place, inside = self._places(heights)
         reach = round(gate_rad / STEP_RAD)
@@ -195,7 +196,9 @@ class _Placement:
         derivatives = np.add.reduceat(self._derivatives(heights) * inside[:, None], self._pieces, axis=0)
         derivatives /= np.maximum(counts, 1)[:, None]
         found = (steps[best] + part) * STEP_RAD
-        return found[is_peak], at[is_peak], derivatives[is_peak], self.creases.level[self._pieces][is_peak]
+        crease = np.searchsorted(self.creases.starts, self._pieces, side="right")
+        level = self.creases.level[self._pieces]
+        return found[is_peak], at[is_peak], derivatives[is_peak], level[is_peak], crease[is_peak]
 
     def result(self, std: float) -> ScenePlane:
         """Return the plane at its place."""
@@ -270,23 +273,27 @@ def _adjust(
     # would move them farther.
     stds = np.concatenate([[planes[idx].uncertainty / 3 for idx in levels], *(one.stds for one in placed.values())])
     start = np.array([heights[idx] for idx in levels])
-    stds[np.argmin(stds[: len(levels)])] *= 0.01  # it stays: creases show no scale
     turns = np.array([at + 1 for at in own.values()])
     for scale in _SCALES_RAD:
         now = np.concatenate([(heights[levels] - start) / scales, *([one.shift, one.turn] for one in placed.values())])
         prior = _tail(now / stds) * stds**-2.0
         matrix, right = np.diag(prior), -prior * now
         for idx, placement in placed.items():
-            residual, contrast, derivatives, level = placement.measured(heights, 5 * scale)
+            residual, contrast, derivatives, level, crease = placement.measured(heights, 5 * scale)
             rows = np.zeros((len(residual), len(stds)))
             rows[:, own[idx] : own[idx] + 2] = derivatives[:, :2]
             which = np.array([column[one] for one in level], np.int64)
             rows[np.arange(len(rows)), which] = derivatives[:, 2] * scales[which]
             weight = np.minimum(contrast / CLEAR_LEVELS, 1.0) / _PIECE_RAD**2
+            # Skirting boards, cornices and their shadows are edges off the planes by about as much.
+            edge = np.column_stack([0.01 * derivatives[:, 2] * scales[which], 0.003 * derivatives[:, 0]])
             for one in np.unique(which):
-                weight[which == one] *= _reliability(residual[which == one], weight[which == one], scale)
-            matrix += (rows * weight[:, None]).T @ rows
-            right += rows.T @ (weight * residual)
+                here = which == one
+                square, product = _information(
+                    rows[here], edge[here], residual[here], weight=weight[here], crease=crease[here], scale=scale
+                )
+                matrix += square
+                right += product
         turned = _off_right_angles(np.array([one.azimuth for one in placed.values()]), stds[turns], 5 * scale)
         weight = 1 / ((5 * scale) ** 2 + turned**2)
         matrix[turns, turns] += weight
@@ -309,11 +316,39 @@ def _off_right_angles(azimuths: FloatArray, stds: FloatArray, scale: float) -> F
     return residual
 
 
-def _reliability(residual: FloatArray, weight: FloatArray, scale: float) -> FloatArray:
-    """Return factors for the weights of the pieces of all creases of two planes, which are off by angles.
+def _information(
+    rows: FloatArray,
+    edge: FloatArray,
+    residual: FloatArray,
+    *,
+    weight: FloatArray,
+    crease: NDArray[np.int64],
+    scale: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what the pieces of all creases of two planes add to the normal equations: matrix and right side.
 
-    Pieces scatter, and have an error in common: what is seen may be a skirting board or a cornice. Both have tails
-    (Cauchy).
+    All views see one edge, whose place relative to the planes is eliminated: `edge` (P, 2) are the changes of the dip
+    when it moves by one standard deviation. `crease` (P,): the crease of one view that a piece belongs to.
+    """
+    off, reliable = residual, weight
+    inverse, product = np.empty((2, 2)), np.empty(2)
+    for _ in range(4):
+        reliable = weight.copy()
+        for one in np.unique(crease):
+            here = crease == one
+            reliable[here] *= _reliability(off[here], weight[here], scale)
+        inverse = np.linalg.inv((edge * reliable[:, None]).T @ edge + np.eye(2))
+        product = inverse @ (edge.T @ (reliable * residual))
+        off = residual - edge @ product
+    weighted = rows * reliable[:, None]
+    shared = weighted.T @ edge
+    return weighted.T @ rows - shared @ inverse @ shared.T, weighted.T @ residual - shared @ product
+
+
+def _reliability(residual: FloatArray, weight: FloatArray, scale: float) -> FloatArray:
+    """Return factors for the weights of the pieces of a crease in one view, which are off by angles.
+
+    Pieces scatter, and have an error in common: views may see different edges. Both have tails (Cauchy).
     """
     order = np.argsort(residual)
     total = np.cumsum(weight[order])
