@@ -307,6 +307,8 @@ def _adjust(
             placement.shift += change[own[idx]]
             placement.turn += change[own[idx] + 1]
     found = np.sqrt(np.diag(np.linalg.inv(matrix)))
+    # All ceilings of eight runs on rendered places were within six of these, but only 87 % within two.
+    found[: len(levels)] *= 3
     return {idx: max(float(found[at]), LEAST_UNCERTAINTY) for idx, at in (column | own).items()}
 
 
