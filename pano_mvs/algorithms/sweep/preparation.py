@@ -8,7 +8,7 @@ surfaces without texture, where all ranges cost about the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, rotate_panorama
 
 _ROWS_AT_ONCE = 256
@@ -38,6 +39,8 @@ class SweepInput:
         settings: what was asked for.
         device: where a backend that can choose computes.
         colors: (H, W, 3) uint8 RGB of the reference, the contrast of which is that of `contrast_picture`; or None.
+        planes: (K, 3) float64 planes p in the reference's frame that it may show, 1/range = p · ray, for backends that
+            compare windows on them.
     """
 
     reference: NDArray[np.uint8]
@@ -48,6 +51,7 @@ class SweepInput:
     settings: SweepSettings
     device: str = "auto"
     colors: NDArray[np.uint8] | None = None
+    planes: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def contrast_picture(self) -> NDArray[np.uint8]:

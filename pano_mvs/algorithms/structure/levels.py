@@ -1,0 +1,84 @@
+"""Find the floors and ceilings of a place before anything is swept at full resolution.
+
+Small sweeps of all views show where there is texture, which most floors have; creases of walls show how high a plain
+ceiling is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
+from pano_mvs.algorithms.structure.planes import find_level_planes
+from pano_mvs.algorithms.structure.view import ScenePlane, plane_view
+from pano_mvs.algorithms.sweep.limits import agreed_ranges
+from pano_mvs.algorithms.views import select_views
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.surfaces import Structure
+from pano_mvs.scene.upright import states_y_down
+
+
+
+def find_levels(
+    poses: Poses, load: Callable[[str], Picture], load_mask: Callable[[str], Mask], *, rng: np.random.Generator
+) -> Structure:
+    """Return the floors and ceilings that bound what the views of each group see, and no other planes.
+
+    A group of poses whose frame does not state that y points down along gravity has none.
+
+    Args:
+        poses: of all views.
+        load: returns the panorama of a view, (H, W, 3) RGB.
+        load_mask: returns its mask, (H, W).
+        rng: draws points and planes.
+    """
+    planes: list[ScenePlane] = []
+    groups: list[int] = []
+    for number, group in enumerate(split_groups(poses)):
+        near = select_views(group, sources=4).neighbours
+        if near and states_y_down(group.frame):
+            planes += _levels_of(group, near, load, load_mask=load_mask, rng=rng)
+            groups += [number] * (len(planes) - len(groups))
+    return Structure(
+        np.array([plane.normal for plane in planes]).reshape(-1, 3),
+        np.array([plane.offset for plane in planes], np.float64),
+        np.array([plane.uncertainty for plane in planes], np.float64),
+        np.array(groups, np.int32),
+    )
+
+
+def _levels_of(
+    group: Poses,
+    near: Mapping[str, Sequence[str]],
+    load: Callable[[str], Picture],
+    *,
+    load_mask: Callable[[str], Mask],
+    rng: np.random.Generator,
+) -> list[ScenePlane]:
+    """Return the planes of one group; `near`: the sources of its views, each of which is a view itself."""
+    names = list(near)
+    cameras = [group.cameras[name] for name in names]
+    pictures = [reduced_panorama(load(name), 512) for name in names]
+    maps = agreed_ranges(
+        pictures,
+        cameras,
+        [[names.index(other) for other in near[name] if other in near] for name in names],
+        masks=[reduced_mask(load_mask(name), 512) for name in names],
+    )
+    views = [
+        plane_view(ranges, lambda picture=picture: picture, camera)  # type: ignore[misc]
+        for ranges, picture, camera in zip(maps, pictures, cameras, strict=True)
+    ]
+    return find_level_planes(views, rng=rng)
+
+
+def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
+    """Return the planes whose front a camera sees as (K, 3) vectors p in its frame, 1/range = p · ray."""
+    heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
+    seen = (levels.group_idx == group) & (heights < 0)
+    return np.asarray(levels.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
