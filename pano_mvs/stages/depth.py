@@ -156,12 +156,10 @@ def sweep(
 def levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
     """Find floors and ceilings before the sweep, in small sweeps of all views and by the creases of walls.
 
-    Only those are kept beyond which views see less than on them. Use it after poses.level: without known gravity, there
-    are none.
+    Only those are kept beyond which views see less than on them. Use it after poses.level: without known gravity, no
+    plane is level.
     """
-    found = find_levels(
-        poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng
-    )
+    found = find_levels(poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng)
     ctx.metric("planes", len(found))
     return found
 

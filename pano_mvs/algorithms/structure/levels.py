@@ -14,14 +14,14 @@ from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.algorithms.structure.planes import find_level_planes
 from pano_mvs.algorithms.structure.view import ScenePlane, plane_view
 from pano_mvs.algorithms.sweep.limits import agreed_ranges
+from pano_mvs.algorithms.sweep.preparation import KnownPlanes
 from pano_mvs.algorithms.views import select_views
-from pano_mvs.core.arrays import FloatArray, Mask, Picture
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
-
 
 
 def find_levels(
@@ -77,8 +77,9 @@ def _levels_of(
     return find_level_planes(views, rng=rng)
 
 
-def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
-    """Return the planes whose front a camera sees as (K, 3) vectors p in its frame, 1/range = p · ray."""
+def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> KnownPlanes:
+    """Return the planes whose front a camera sees, in its frame; floors bound, and stairs lead up through ceilings."""
     heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
     seen = (levels.group_idx == group) & (heights < 0)
-    return np.asarray(levels.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
+    normals = levels.normals_in_world[seen]
+    return KnownPlanes(normals @ cam_from_world.rotation.T / heights[seen, None], normals[:, 1] < 0)

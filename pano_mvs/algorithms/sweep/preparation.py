@@ -8,7 +8,8 @@ surfaces without texture, where all ranges cost about the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +27,16 @@ from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, ro
 _ROWS_AT_ONCE = 256
 
 
+class KnownPlanes(NamedTuple):
+    """Planes that a reference may show.
+
+    `per_range`: (K, 3) vectors p in its frame, 1/range = p · ray. `bounds`: (K,) whether little lies beyond one.
+    """
+
+    per_range: FloatArray
+    bounds: NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class SweepInput:
     """Everything that a backend needs, checked and prepared.
@@ -39,8 +50,7 @@ class SweepInput:
         settings: what was asked for.
         device: where a backend that can choose computes.
         colors: (H, W, 3) uint8 RGB of the reference, the contrast of which is that of `contrast_picture`; or None.
-        planes: (K, 3) float64 planes p in the reference's frame that it may show, 1/range = p · ray, for backends that
-            compare windows on them.
+        planes: that the reference may show, for backends that compare windows on them.
     """
 
     reference: NDArray[np.uint8]
@@ -51,7 +61,7 @@ class SweepInput:
     settings: SweepSettings
     device: str = "auto"
     colors: NDArray[np.uint8] | None = None
-    planes: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    planes: KnownPlanes | None = None
 
     @property
     def contrast_picture(self) -> NDArray[np.uint8]:

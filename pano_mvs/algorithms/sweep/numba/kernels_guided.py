@@ -149,8 +149,8 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
 def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
     """Lower the costs of the planes nearest to candidates to theirs.
 
-    `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where there
-    is none. `volume`: (rows, D, W) costs, lowered.
+    `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where
+    the plane is not seen. `volume`: (rows, D, W) costs, lowered.
     """
     count, last = costs.shape[1], volume.shape[1] - 1
     for j in range(guide.shape[0]):
@@ -169,7 +169,7 @@ def raise_beyond(farthest: F32, volume: U8, row: int) -> None:
     for d in range(volume.shape[1]):
         for i in range(volume.shape[2]):
             if _F(d) > farthest[row, i]:
-                # A chance match costs 127, a right one on texture a third of it. Of 20, 40 and 80 all did much the same.
+                # A chance match costs 127, a right one on texture a third of it. 20 and 80 did much the same.
                 volume[row, d, i] = min(volume[row, d, i] + 40, 255)
 
 
