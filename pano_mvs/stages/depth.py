@@ -20,9 +20,10 @@ from pano_mvs.algorithms.patchmatch.full_size import (
 )
 from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_at_scale, refine_plain_surfaces, refine_range
 from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, ranges_of_levels, reduced, sharp_halvings
-from pano_mvs.algorithms.structure.levels import find_levels, planes_before
+from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.preparation import KnownPlanes
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.algorithms.views import select_views
@@ -102,7 +103,7 @@ def sweep(
     pose: Each[Pose],
     sources: Near[Panorama],
     source_poses: Near[Pose],
-    levels: One[Structure] | None,
+    known: One[Structure] | None,
     params: SweepParams,
     ctx: Context,
 ) -> RangeMap:
@@ -139,11 +140,11 @@ def sweep(
             device=params.device,
             reference_mask=valid[0],
             source_masks=valid[1:],
-            planes=None if levels is None else planes_before(levels, poses[0], pose.group),
+            planes=None if known is None else KnownPlanes.before(known, poses[0], pose.group),
         )
 
-    coarser = coarser_levels(pictures[0].shape[:2]) if params.multiscale and params.scale != "nominal" else 0
-    found = ranges_of_levels(coarser, lambda level: reduced(pictures[:1], [], halvings=level)[0][0], swept)
+    levels = coarser_levels(pictures[0].shape[:2]) if params.multiscale and params.scale != "nominal" else 0
+    found = ranges_of_levels(levels, lambda level: reduced(pictures[:1], [], halvings=level)[0][0], swept)
     range_map = enlarged_range_map(found, ref.size_hw)
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("sources", len(sources))
@@ -153,7 +154,7 @@ def sweep(
 
 
 @stage("depth.levels")
-def levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
+def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
     """Find floors and ceilings before the sweep, in small sweeps of all views and by the creases of walls.
 
     Only those are kept beyond which views see less than on them. Use it after poses.level: without known gravity, no

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.structure.levels import find_levels, planes_before
+from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.structure.planes import find_level_planes
 from pano_mvs.algorithms.structure.view import PlaneView
 from pano_mvs.algorithms.sweep.numba.kernels_guided import lower_at_candidates, raise_beyond
@@ -62,13 +62,13 @@ def test_planes_before_a_camera_give_the_ranges_of_its_rays() -> None:
         np.zeros(3, np.int32),
     )
     camera = cameras[1]
-    planes, bounds = planes_before(levels, camera, 0)
+    planes, bounds = KnownPlanes.before(levels, camera, 0)
     assert bounds.tolist() == [True, False]
     rays = ray_grid(SIZE)
     inverse = (rays @ planes.T).max(axis=-1)
     points = camera.inverse().apply(rays / inverse[..., None])
     assert np.allclose(np.where(points[..., 1] > 0, points[..., 1] - FLOOR, points[..., 1] - CEILING), 0, atol=1e-9)
-    assert len(planes_before(levels, camera, 1).bounds) == 0
+    assert len(KnownPlanes.before(levels, camera, 1).bounds) == 0
 
 
 def _view(ranges: NDArray[np.float32], center: Sequence[float]) -> PlaneView:
@@ -140,10 +140,10 @@ def test_kernels_lower_costs_at_candidates_and_raise_those_beyond() -> None:
     guide[0, 0] = -np.inf
     expected = volume.copy()
     for j, i in np.ndindex(rows, width):
-        for k in range(7):
-            plane = np.rint(guide[j, i]) + k - 3
-            if 0 <= plane < planes:
-                expected[j, int(plane), i] = min(expected[j, int(plane), i], costs[j, k, i])
+        offsets = np.arange(planes) - guide[j, i]
+        near = np.abs(offsets) < 3
+        between = np.interp(offsets[near], np.arange(-3, 4), costs[j, :, i].astype(float))
+        expected[j, near, i] = np.minimum(expected[j, near, i], between + 0.5)
     lowered = volume.copy()
     lower_at_candidates(costs, guide, lowered)
     np.testing.assert_array_equal(lowered, expected)

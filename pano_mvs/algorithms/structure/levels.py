@@ -14,10 +14,8 @@ from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.algorithms.structure.planes import find_level_planes
 from pano_mvs.algorithms.structure.view import ScenePlane, plane_view
 from pano_mvs.algorithms.sweep.limits import agreed_ranges
-from pano_mvs.algorithms.sweep.preparation import KnownPlanes
 from pano_mvs.algorithms.views import select_views
 from pano_mvs.core.arrays import Mask, Picture
-from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surfaces import Structure
@@ -75,11 +73,3 @@ def _levels_of(
         for ranges, picture, camera in zip(maps, pictures, cameras, strict=True)
     ]
     return find_level_planes(views, rng=rng)
-
-
-def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> KnownPlanes:
-    """Return the planes whose front a camera sees, in its frame; floors bound, and stairs lead up through ceilings."""
-    heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
-    seen = (levels.group_idx == group) & (heights < 0)
-    normals = levels.normals_in_world[seen]
-    return KnownPlanes(normals @ cam_from_world.rotation.T / heights[seen, None], normals[:, 1] < 0)

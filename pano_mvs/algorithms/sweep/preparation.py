@@ -23,6 +23,7 @@ from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, rotate_panorama
+from pano_mvs.scene.surfaces import Structure
 
 _ROWS_AT_ONCE = 256
 
@@ -35,6 +36,14 @@ class KnownPlanes(NamedTuple):
 
     per_range: FloatArray
     bounds: NDArray[np.bool_]
+
+    @staticmethod
+    def before(levels: Structure, cam_from_world: Rigid3, group: int) -> KnownPlanes:
+        """Return the level planes whose front a camera sees; floors bound, and stairs lead up through ceilings."""
+        heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
+        seen = (levels.group_idx == group) & (heights < 0)
+        normals = levels.normals_in_world[seen]
+        return KnownPlanes(normals @ cam_from_world.rotation.T / heights[seen, None], normals[:, 1] < 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,20 +147,23 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
 
 @kernel
 def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
-    """Lower the costs of the planes nearest to candidates to theirs.
+    """Lower the costs of the planes among the candidates to what lies between the two candidates around each.
 
-    `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where
-    the plane is not seen. `volume`: (rows, D, W) costs, lowered.
+    `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where it
+    is not seen. `volume`: (rows, D, W) costs, lowered.
     """
     count, last = costs.shape[1], volume.shape[1] - 1
     for j in range(guide.shape[0]):
         for i in range(guide.shape[1]):
             if guide[j, i] >= _F(0):
-                nearest = int(np.rint(guide[j, i]))
-                for k in range(count):
-                    plane = nearest + k - count // 2
-                    if 0 <= plane <= last and costs[j, k, i] < volume[j, plane, i]:
-                        volume[j, plane, i] = costs[j, k, i]
+                first = guide[j, i] - _F(count // 2)
+                start = int(np.ceil(first))
+                share = _F(start) - first
+                for k in range(count - 1):
+                    plane = start + k
+                    if 0 <= plane <= last:
+                        between = (_F(1) - share) * costs[j, k, i] + share * costs[j, k + 1, i]
+                        volume[j, plane, i] = min(volume[j, plane, i], int(between + _F(0.5)))
 
 
 @kernel
