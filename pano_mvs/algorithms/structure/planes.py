@@ -65,7 +65,8 @@ def find_level_planes(views: Sequence[PlaneView], *, rng: np.random.Generator) -
     points = _drawn_points(views, rng)
     if points is None:
         return []
-    least, tolerance = 0.006 * 4 * np.pi * len(views), 0.03
+    # Half of the error within which two small sweeps agree.
+    least, tolerance = 0.006 * 4 * np.pi * len(views), 0.05
     found = _floors_and_ceilings(views, points, rng=rng, tolerance=tolerance, least=least)
     return [plane for plane in found if _bounds(points, plane, tolerance=tolerance)]
 
