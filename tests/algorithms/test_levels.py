@@ -143,7 +143,7 @@ def test_kernels_lower_costs_at_candidates_and_raise_those_beyond() -> None:
         offsets = np.arange(planes) - guide[j, i]
         near = np.abs(offsets) < 3
         between = np.interp(offsets[near], np.arange(-3, 4), costs[j, :, i].astype(float))
-        expected[j, near, i] = np.minimum(expected[j, near, i], between + 0.5)
+        expected[j, near, i] = np.minimum(expected[j, near, i], between + 10 * np.abs(offsets[near]) + 0.5)
     lowered = volume.copy()
     lower_at_candidates(costs, guide, lowered)
     np.testing.assert_array_equal(lowered, expected)

@@ -149,6 +149,8 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
 def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
     """Lower the costs of the planes among the candidates to what lies between the two candidates around each.
 
+    They rise by 10 for each plane from the guide, which decides where there is no texture.
+
     `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where it
     is not seen. `volume`: (rows, D, W) costs, lowered.
     """
@@ -163,6 +165,7 @@ def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
                     plane = start + k
                     if 0 <= plane <= last:
                         between = (_F(1) - share) * costs[j, k, i] + share * costs[j, k + 1, i]
+                        between += _F(10) * abs(_F(plane) - guide[j, i])
                         volume[j, plane, i] = min(volume[j, plane, i], int(between + _F(0.5)))
 
 
