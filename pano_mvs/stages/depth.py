@@ -111,8 +111,8 @@ def sweep(
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
     must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
-    edges are still better than at that one. With the floors and ceilings of depth.levels, windows on these are matched
-    too, and ranges beyond them count less.
+    edges are still better than at that one. With the floors of depth.levels, windows on these are matched too, and
+    ranges below them count less.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
@@ -155,9 +155,9 @@ def sweep(
 
 @stage("depth.levels")
 def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
-    """Find floors and ceilings before the sweep, in small sweeps of all views and by the creases of walls.
+    """Find floors before the sweep, in small sweeps of all views.
 
-    Only those are kept beyond which views see less than on them. Use it after poses.level: without known gravity, no
+    Only those are kept below which views see less than on them. Use it after poses.level: without known gravity, no
     plane is level.
     """
     found = find_levels(poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng)

@@ -51,14 +51,20 @@ def find_planes(
     if points is None:
         return []
     least = min_share * 4 * np.pi
-    planes = _floors_and_ceilings(views, points, rng=rng, tolerance=max_relative_error, least=least)
+    planes = [
+        plane
+        for normal in (UP, -UP)
+        for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
+    ]
+    planes = moved_ceilings(views, planes)
+    planes += supposed_ceiling(views, planes)
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
     planes += outline_planes(views, planes, threads=threads)
     return placed_by_creases(views, planes, max_relative_error=max_relative_error, threads=threads)
 
 
-def find_level_planes(views: Sequence[PlaneView], *, rng: np.random.Generator) -> list[ScenePlane]:
-    """Return the level planes of `find_planes`, whose arguments these are, that bound what their views see.
+def find_floors(views: Sequence[PlaneView], *, rng: np.random.Generator) -> list[ScenePlane]:
+    """Return the level planes below the views of one group, whose world has y down, that bound what they see.
 
     More of what views see is on such a plane than beyond it: a table top does not bound, the floor around it does.
     """
@@ -67,36 +73,18 @@ def find_level_planes(views: Sequence[PlaneView], *, rng: np.random.Generator) -
         return []
     # Half of the error within which two small sweeps agree.
     least, tolerance = 0.006 * 4 * np.pi * len(views), 0.05
-    found = _floors_and_ceilings(views, points, rng=rng, tolerance=tolerance, least=least)
+    found = _level_planes(points, UP, rng=rng, tolerance=tolerance, least=least)
     return [plane for plane in found if _bounds(points, plane, tolerance=tolerance)]
 
 
 def _bounds(points: _Points, plane: ScenePlane, *, tolerance: float) -> bool:
-    """Return whether more points are on a plane than beyond it, of those whose cameras are before it.
-
-    A ceiling that creases show has no points of its own.
-    """
-    if plane.support == 0:
-        return True
+    """Return whether more points are on a plane than beyond it, of those whose cameras are before it."""
     before = np.flatnonzero(points.centers @ plane.normal > plane.offset)
     with np.errstate(invalid="ignore"):
         errors = points.errors(plane.normal, plane.offset, before)
         faces = points.rays[before] @ plane.normal < 0
         on_it, beyond = np.abs(errors) < tolerance, errors < -2 * tolerance
     return bool(points.weight[before][faces & on_it].sum() >= points.weight[before][faces & beyond].sum())
-
-
-def _floors_and_ceilings(
-    views: Sequence[PlaneView], points: _Points, *, rng: np.random.Generator, tolerance: float, least: float
-) -> list[ScenePlane]:
-    """Return the level planes of `find_planes`, and take their points."""
-    planes = [
-        plane
-        for normal in (UP, -UP)
-        for plane in _level_planes(points, normal, rng=rng, tolerance=tolerance, least=least)
-    ]
-    planes = moved_ceilings(views, planes)
-    return planes + supposed_ceiling(views, planes)
 
 
 @dataclass(eq=False)

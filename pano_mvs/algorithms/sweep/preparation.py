@@ -39,7 +39,7 @@ class KnownPlanes(NamedTuple):
 
     @staticmethod
     def before(levels: Structure, cam_from_world: Rigid3, group: int) -> KnownPlanes:
-        """Return the level planes whose front a camera sees; floors bound, and stairs lead up through ceilings."""
+        """Return the level planes whose front a camera sees."""
         heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
         seen = (levels.group_idx == group) & (heights < 0)
         normals = levels.normals_in_world[seen]
