@@ -23,7 +23,7 @@ from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, range
 from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
-from pano_mvs.algorithms.sweep.preparation import KnownPlanes
+from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.algorithms.views import select_views
@@ -140,7 +140,7 @@ def sweep(
             device=params.device,
             reference_mask=valid[0],
             source_masks=valid[1:],
-            planes=None if known is None else KnownPlanes.before(known, poses[0], pose.group),
+            planes=None if known is None else planes_before(known, poses[0], pose.group),
         )
 
     levels = coarser_levels(pictures[0].shape[:2]) if params.multiscale and params.scale != "nominal" else 0

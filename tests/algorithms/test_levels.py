@@ -13,9 +13,9 @@ from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.structure.planes import find_floors
 from pano_mvs.algorithms.structure.view import PlaneView
 from pano_mvs.algorithms.sweep.numba.kernels_guided import lower_at_candidates, raise_beyond
-from pano_mvs.algorithms.sweep.preparation import KnownPlanes
+from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.core.arrays import Picture
+from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from pano_mvs.scene.surfaces import Structure
@@ -62,13 +62,13 @@ def test_planes_before_a_camera_give_the_ranges_of_its_rays() -> None:
         np.zeros(3, np.int32),
     )
     camera = cameras[1]
-    planes, bounds = KnownPlanes.before(levels, camera, 0)
-    assert bounds.tolist() == [True, False]
+    planes = planes_before(levels, camera, 0)
+    assert planes.shape == (2, 3)
     rays = ray_grid(SIZE)
     inverse = (rays @ planes.T).max(axis=-1)
     points = camera.inverse().apply(rays / inverse[..., None])
     assert np.allclose(np.where(points[..., 1] > 0, points[..., 1] - FLOOR, points[..., 1] - CEILING), 0, atol=1e-9)
-    assert len(KnownPlanes.before(levels, camera, 1).bounds) == 0
+    assert len(planes_before(levels, camera, 1)) == 0
 
 
 def _view(ranges: NDArray[np.float32], center: Sequence[float]) -> PlaneView:
@@ -109,26 +109,22 @@ def _far_apart() -> tuple[list[Picture], list[Rigid3], NDArray[np.float32]]:
     return [picture for picture, _ in views], poses[1:], views[0][1]
 
 
-def _swept(planes: KnownPlanes | None) -> NDArray[np.float32]:
+def _swept(planes: FloatArray | None) -> NDArray[np.float32]:
     pictures, poses, _ = _far_apart()
     settings = SweepSettings(planes=64, no_match="keep")
     return sweep_range(pictures[0], pictures[1:], poses, near=0.4, far=6.0, settings=settings, planes=planes).range
 
 
-def _floor(*, bounds: bool) -> KnownPlanes:
-    return KnownPlanes(np.array([[0.0, 1 / FLOOR, 0.0]]), np.array([bounds]))
-
-
 def test_windows_on_the_floor_find_it_where_others_do_not() -> None:
     truth = _far_apart()[2]
     floor = np.abs(truth * ray_grid(SIZE)[..., 1] - FLOOR) < 1e-3
-    without, with_floor = (np.abs(_swept(planes) / truth - 1) for planes in (None, _floor(bounds=True)))
+    without, with_floor = (np.abs(_swept(planes) / truth - 1) for planes in (None, np.array([[0.0, 1 / FLOOR, 0.0]])))
     assert (with_floor < 0.05)[floor].mean() > (without < 0.05)[floor].mean() + 0.2
     assert (with_floor < 0.05).mean() > (without < 0.05).mean() + 0.05
 
 
 def test_no_plane_changes_nothing() -> None:
-    np.testing.assert_array_equal(_swept(None), _swept(KnownPlanes(np.zeros((0, 3)), np.zeros(0, np.bool_))))
+    np.testing.assert_array_equal(_swept(None), _swept(np.zeros((0, 3))))
 
 
 def test_kernels_lower_costs_at_candidates_and_raise_those_beyond() -> None:

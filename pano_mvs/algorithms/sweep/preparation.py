@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,22 +27,11 @@ from pano_mvs.scene.surfaces import Structure
 _ROWS_AT_ONCE = 256
 
 
-class KnownPlanes(NamedTuple):
-    """Planes that a reference may show.
-
-    `per_range`: (K, 3) vectors p in its frame, 1/range = p · ray. `bounds`: (K,) whether little lies beyond one.
-    """
-
-    per_range: FloatArray
-    bounds: NDArray[np.bool_]
-
-    @staticmethod
-    def before(levels: Structure, cam_from_world: Rigid3, group: int) -> KnownPlanes:
-        """Return the level planes whose front a camera sees."""
-        heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
-        seen = (levels.group_idx == group) & (heights < 0)
-        normals = levels.normals_in_world[seen]
-        return KnownPlanes(normals @ cam_from_world.rotation.T / heights[seen, None], normals[:, 1] < 0)
+def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
+    """Return the planes whose front a camera sees as (K, 3) vectors p in its frame, 1/range = p · ray."""
+    heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
+    seen = (levels.group_idx == group) & (heights < 0)
+    return np.asarray(levels.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +47,8 @@ class SweepInput:
         settings: what was asked for.
         device: where a backend that can choose computes.
         colors: (H, W, 3) uint8 RGB of the reference, the contrast of which is that of `contrast_picture`; or None.
-        planes: that the reference may show, for backends that compare windows on them.
+        planes: (K, 3) vectors p in the reference's frame, 1/range = p · ray, of planes that it may show and beyond
+            which little lies, for backends that compare windows on them; or None.
     """
 
     reference: NDArray[np.uint8]
@@ -70,7 +59,7 @@ class SweepInput:
     settings: SweepSettings
     device: str = "auto"
     colors: NDArray[np.uint8] | None = None
-    planes: KnownPlanes | None = None
+    planes: FloatArray | None = None
 
     @property
     def contrast_picture(self) -> NDArray[np.uint8]:

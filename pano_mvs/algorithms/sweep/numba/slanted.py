@@ -30,7 +30,7 @@ def inverse_table(work: SweepInput) -> NDArray[np.float32]:
 
 
 def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top: int) -> None:
-    """Give hypotheses near a plane the costs of windows on it, where these are less; raise those beyond all bounds.
+    """Give hypotheses near a plane the costs of windows on it, where these are less; raise those beyond all planes.
 
     `volume`: (rows, D, W) costs, changed. `top`: the first of these rows.
     """
@@ -40,11 +40,11 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
     halo = work.settings.compare_radius + work.settings.box_radius
     table, rays = inverse_table(work), ray_grid((height, width))
     farthest = np.zeros((height, width), np.float32)
-    for plane, bounds in zip(*work.planes, strict=True):
+    for plane in work.planes:
         inverse = rays @ plane
         met = inverse > table[-1]
         position = np.interp(-inverse, -table.astype(np.float64), np.arange(len(table)) / TABLE_PER_PLANE)
-        farthest = np.maximum(farthest, np.where(met & bounds, position + STEPS, 0)).astype(np.float32)
+        farthest = np.maximum(farthest, np.where(met, position + STEPS, 0)).astype(np.float32)
         guide = pad_panorama(position.astype(np.float32), halo)[:, halo:-halo]
 
         def match(first: int, *, guide: NDArray[np.float32] = guide, met: NDArray[np.bool_] = met) -> None:
