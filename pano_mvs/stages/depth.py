@@ -20,13 +20,16 @@ from pano_mvs.algorithms.patchmatch.full_size import (
 )
 from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_at_scale, refine_plain_surfaces, refine_range
 from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, ranges_of_levels, reduced, sharp_halvings
+from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.algorithms.views import select_views
 from pano_mvs.api import (
     NOT_IN_KEY,
+    All,
     Context,
     Each,
     Near,
@@ -47,6 +50,7 @@ from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.io.growing_arrays import GrowingArrays
 from pano_mvs.scene.pose_groups import require_one_group
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.filters import bytes_per_pixel
 
 _PICTURE_BYTES, _RESULT_BYTES = 16, 40
@@ -99,6 +103,7 @@ def sweep(
     pose: Each[Pose],
     sources: Near[Panorama],
     source_poses: Near[Pose],
+    known: One[Structure] | None,
     params: SweepParams,
     ctx: Context,
 ) -> RangeMap:
@@ -106,7 +111,8 @@ def sweep(
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
     must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
-    edges are still better than at that one.
+    edges are still better than at that one. With the floors of depth.levels, windows on these are matched too, and
+    ranges below them count less.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
@@ -134,6 +140,7 @@ def sweep(
             device=params.device,
             reference_mask=valid[0],
             source_masks=valid[1:],
+            planes=None if known is None else planes_before(known, poses[0], pose.group),
         )
 
     levels = coarser_levels(pictures[0].shape[:2]) if params.multiscale and params.scale != "nominal" else 0
@@ -144,6 +151,18 @@ def sweep(
     ctx.metric("near", near)
     ctx.metric("far", far)
     return range_map
+
+
+@stage("depth.levels")
+def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
+    """Find floors before the sweep, in small sweeps of all views.
+
+    Only those are kept below which views see less than on them. Use it after poses.level: without known gravity, no
+    plane is level.
+    """
+    found = find_levels(poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng)
+    ctx.metric("planes", len(found))
+    return found
 
 
 @stage("views.nearest", settings=select_views)

@@ -115,6 +115,7 @@ def test_blurred_panoramas_are_swept_at_a_lower_and_large_ones_at_coarser_resolu
         pose=Pose(Rigid3.identity()),
         sources=[panorama],
         source_poses=[Pose(Rigid3(np.eye(3), np.ones(3)))],
+        known=None,
         params=depth.SweepParams(near=1.0, far=9.0, **settings),
         ctx=Context(np.random.default_rng(0), tmp_path),
     )

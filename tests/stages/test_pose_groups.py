@@ -402,7 +402,7 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
 @pytest.mark.parametrize(
     ("function", "extras"),
     [
-        (sweep, {"ref": None, "params": SweepParams()}),
+        (sweep, {"ref": None, "known": None, "params": SweepParams()}),
         (patchmatch, {"ref": None, "range_map": None, "params": PatchMatchParams()}),
         (exchange, {"ref": None, "range_map": None, "source_images": [None], "params": ExchangeParams()}),
         (consistency, {"range_map": None, "image": None, "params": ConsistencyParams()}),

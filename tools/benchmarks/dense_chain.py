@@ -55,6 +55,12 @@ class DenseRun:
                 maps[name] = found
         return maps
 
+    @property
+    def planes(self) -> Structure | None:
+        """The planes of the place that the last stage found which finds any."""
+        found = [item for items in self.results.values() for item in items.values() if isinstance(item, Structure)]
+        return found[-1] if found else None
+
 
 class DenseChain:
     """The dense stages of a workflow, ready to run on captures.
@@ -173,10 +179,7 @@ class DenseChain:
             ranges=run.range_maps[self.graph.edges[name]["ranges"].producer],
             poses={image: Pose(pose) for image, pose in capture.poses.items()},
             images=dict(capture.panoramas),
-            planes=next(
-                (planes for made in run.results.values() for planes in made.values() if isinstance(planes, Structure)),
-                None,
-            ),
+            planes=run.planes,
             **extras(entry),
         )
         assert isinstance(cloud, PointCloud)

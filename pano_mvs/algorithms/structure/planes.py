@@ -63,6 +63,30 @@ def find_planes(
     return placed_by_creases(views, planes, max_relative_error=max_relative_error, threads=threads)
 
 
+def find_floors(views: Sequence[PlaneView], *, rng: np.random.Generator) -> list[ScenePlane]:
+    """Return the level planes below the views of one group, whose world has y down, that bound what they see.
+
+    More of what views see is on such a plane than beyond it: a table top does not bound, the floor around it does.
+    """
+    points = _drawn_points(views, rng)
+    if points is None:
+        return []
+    # Half of the error within which two small sweeps agree.
+    least, tolerance = 0.006 * 4 * np.pi * len(views), 0.05
+    found = _level_planes(points, UP, rng=rng, tolerance=tolerance, least=least)
+    return [plane for plane in found if _bounds(points, plane, tolerance=tolerance)]
+
+
+def _bounds(points: _Points, plane: ScenePlane, *, tolerance: float) -> bool:
+    """Return whether more points are on a plane than beyond it, of those whose cameras are before it."""
+    before = np.flatnonzero(points.centers @ plane.normal > plane.offset)
+    with np.errstate(invalid="ignore"):
+        errors = points.errors(plane.normal, plane.offset, before)
+        faces = points.rays[before] @ plane.normal < 0
+        on_it, beyond = np.abs(errors) < tolerance, errors < -2 * tolerance
+    return bool(points.weight[before][faces & on_it].sum() >= points.weight[before][faces & beyond].sum())
+
+
 @dataclass(eq=False)
 class _Points:
     """Points of all views: positions, centres of their cameras, rays, normals (N, 3 each); `left` are still free."""

@@ -36,19 +36,16 @@ from pano_mvs.algorithms.sweep.numba.kernels_guided import (
 )
 from pano_mvs.algorithms.sweep.numba.kernels_records import Guide
 from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
+from pano_mvs.algorithms.sweep.numba.slanted import STEPS, TABLE_PER_PLANE, inverse_table
 from pano_mvs.algorithms.sweep.numba.threads import Pool, run_jobs, workers
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput, is_bare, pixels_with_valid_window
 from pano_mvs.algorithms.sweep.winner import Winners, subplane_offset
 from pano_mvs.geometry import pad_panorama
 
-STEPS = 3
-"""Planes on either side of a guide that are tried."""
-
 _COUNT = 2 * STEPS + 1
 _STRIP_LINES = 64
 _ROW_LINES = 32
-_TABLE_PER_PLANE = 8
 # Guides closer than this are one surface.
 _MIN_GAP = 0.5
 _SEARCH_STEP = 2
@@ -68,8 +65,7 @@ class GuidedSweep:
         self._by_paths = work.settings.aggregation == "sgm"
         self.volume = np.empty((height, 2 * _COUNT, width), np.uint8 if self._by_paths else np.float32)
         self._shared = sweep_arguments(work)
-        positions = np.arange((work.settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
-        self._table = (1 / work.range_at(positions)).astype(np.float32)
+        self._table = inverse_table(work)
 
     def find_winners(self) -> Winners:
         """Return the winning candidates and the costs around them."""
@@ -99,7 +95,7 @@ class GuidedSweep:
         if not self._by_paths:
             sweep = sweep._replace(scale=np.float32(0))
         costs = np.empty((run.rows, _COUNT, len(columns)), self.volume.dtype)
-        sweep_guided_band(run.first, sweep, sweep.others, Guide(around, self._table, _TABLE_PER_PLANE), costs)
+        sweep_guided_band(run.first, sweep, sweep.others, Guide(around, self._table, TABLE_PER_PLANE), costs)
         rows, own = run.place
         self.volume[rows, layer * _COUNT : (layer + 1) * _COUNT, own] = costs[:, :, run.inner]
 

@@ -21,7 +21,7 @@ from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 # Rounding the limits outward to steps of a quarter octave keeps the planes, and with them the ranges, the same when
 # the pictures change by next to nothing.
@@ -73,18 +73,9 @@ def limits_by_sweeping(
     small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MAX_PICTURES]]
     sweeps = _SmallSweeps(small, small_masks, poses, helper_backend(backend), device)
     nearest, farthest = range_limits(_baselines(0, poses), width=width)
-    maps = [_coarse(idx, sweeps, width=width) for idx in range(len(poses))]
-    checked = check_consistency(
-        maps[0],
-        poses[0],
-        maps[1:],
-        source_poses=poses[1:],
-        max_relative_error=0.1,
-        max_reprojection_px=1.5,
-        min_support=0,
-        min_motion_px=0,
-    )
-    agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(small[0])
+    maps = [_coarse(idx, sweeps, _others(idx, poses), width=width) for idx in range(len(poses))]
+    checked = _agreed(0, maps, range(1, len(poses)), sweeps=sweeps)
+    agreed = checked.confidence >= CONSISTENT_CONFIDENCE[0]
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()
     if solid_angle[agreed].sum() <= 0.01 * seen_angle:
@@ -112,9 +103,8 @@ class _SmallSweeps:
     backend: str
     device: str
 
-    def range_map(self, idx: int, *, near: float, far: float) -> RangeMap:
-        """Return the range map of one of the pictures, swept against all others that are at another place."""
-        others = [other for other, baseline in enumerate(_baselines(idx, self.poses)) if baseline > 0]
+    def range_map(self, idx: int, others: Sequence[int], *, near: float, far: float) -> RangeMap:
+        """Return the range map of one of the pictures, swept against some others."""
         return sweep_range(
             self.pictures[idx],
             [self.pictures[other] for other in others],
@@ -129,11 +119,46 @@ class _SmallSweeps:
         )
 
 
-def _coarse(idx: int, sweeps: _SmallSweeps, *, width: int) -> RangeMap:
+def agreed_ranges(
+    pictures: Sequence[NDArray[np.uint8]],
+    cams_from_world: Sequence[Rigid3],
+    sources: Sequence[Sequence[int]],
+    *,
+    masks: Sequence[NDArray[np.bool_]],
+) -> list[RangeMap]:
+    """Return range maps of 256 columns for all views, from small sweeps between very wide limits.
+
+    They are consistent (confidence 128 or more) where there is texture and a source agrees, and filled elsewhere.
+    `sources`: of each view, the positions of others at other places.
+    """
+    small = [reduced_panorama(picture, _WIDTH) for picture in pictures]
+    sweeps = _SmallSweeps(small, [reduced_mask(mask, _WIDTH) for mask in masks], list(cams_from_world), "numba", "auto")
+    maps = [_coarse(idx, sweeps, others, width=pictures[idx].shape[1]) for idx, others in enumerate(sources)]
+    return [_agreed(idx, maps, others, sweeps=sweeps) for idx, others in enumerate(sources)]
+
+
+def _coarse(idx: int, sweeps: _SmallSweeps, others: Sequence[int], *, width: int) -> RangeMap:
     """Return the range map of one of the pictures between very wide limits."""
-    baselines = _baselines(idx, sweeps.poses)
+    baselines = [_baselines(idx, sweeps.poses)[other] for other in others]
     far = range_limits(baselines, width=width)[1]
-    return sweeps.range_map(idx, near=_NEAREST_BASELINES * mean_baseline(baselines), far=far)
+    return sweeps.range_map(idx, others, near=_NEAREST_BASELINES * mean_baseline(baselines), far=far)
+
+
+def _agreed(idx: int, maps: Sequence[RangeMap], others: Sequence[int], *, sweeps: _SmallSweeps) -> RangeMap:
+    """Return a map that is consistent where there is texture and another one agrees, and filled elsewhere."""
+    checked = check_consistency(
+        maps[idx],
+        sweeps.poses[idx],
+        [maps[other] for other in others],
+        source_poses=[sweeps.poses[other] for other in others],
+        max_relative_error=0.1,
+        max_reprojection_px=1.5,
+        min_support=0,
+        min_motion_px=0,
+    )
+    agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(sweeps.pictures[idx])
+    confidence = np.where(agreed, checked.confidence, np.minimum(checked.confidence, np.uint8(FILLED_CONFIDENCE[1])))
+    return RangeMap(checked.range, confidence)
 
 
 def _lowered(near: float, far: float, sweeps: _SmallSweeps) -> float:
@@ -141,14 +166,20 @@ def _lowered(near: float, far: float, sweeps: _SmallSweeps) -> float:
     bare = is_bare(sweeps.pictures[0])
     most_px = _MIN_ENDED_SHARE * 2 / np.pi * bare.size
     baseline = mean_baseline(_baselines(0, sweeps.poses))
+    others = _others(0, sweeps.poses)
     for step in range(4 + 1):
         lower = near / 2 ** (step / 2)
-        found = sweeps.range_map(0, near=lower, far=far)
+        found = sweeps.range_map(0, others, near=lower, far=far)
         first = range_at(3, lower, far, planes=_PLANES, spacing=_SETTINGS.spacing, baseline=baseline)
         ended = np.where(bare & (found.range < first), np.float32(lower), np.float32(np.nan))
         if not remove_speckles(with_ranges(found, ended), max_size_px=most_px).valid.any():
             return float(lower)
     return near
+
+
+def _others(idx: int, poses: Sequence[Rigid3]) -> list[int]:
+    """Return the cameras that are at another place than one of them."""
+    return [other for other, baseline in enumerate(_baselines(idx, poses)) if baseline > 0]
 
 
 def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:

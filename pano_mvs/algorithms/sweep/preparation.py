@@ -20,9 +20,18 @@ from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, rotate_panorama
+from pano_mvs.scene.surfaces import Structure
 
 _ROWS_AT_ONCE = 256
+
+
+def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
+    """Return the planes whose front a camera sees as (K, 3) vectors p in its frame, 1/range = p · ray."""
+    heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
+    seen = (levels.group_idx == group) & (heights < 0)
+    return np.asarray(levels.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +47,8 @@ class SweepInput:
         settings: what was asked for.
         device: where a backend that can choose computes.
         colors: (H, W, 3) uint8 RGB of the reference, the contrast of which is that of `contrast_picture`; or None.
+        planes: (K, 3) vectors p in the reference's frame, 1/range = p · ray, of planes that it may show and beyond
+            which little lies, for backends that compare windows on them; or None.
     """
 
     reference: NDArray[np.uint8]
@@ -48,6 +59,7 @@ class SweepInput:
     settings: SweepSettings
     device: str = "auto"
     colors: NDArray[np.uint8] | None = None
+    planes: FloatArray | None = None
 
     @property
     def contrast_picture(self) -> NDArray[np.uint8]:

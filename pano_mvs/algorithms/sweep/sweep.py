@@ -8,6 +8,7 @@ S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import ceil
 
 import numpy as np
@@ -27,7 +28,7 @@ from pano_mvs.algorithms.sweep.preparation import (
 )
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS, SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
-from pano_mvs.core.arrays import Mask, Picture
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.masking import placed_mask
@@ -52,6 +53,7 @@ def sweep_range(
     device: str = "auto",
     reference_mask: Mask | None = None,
     source_masks: Sequence[Mask | None] | None = None,
+    planes: FloatArray | None = None,
 ) -> RangeMap:
     """Return the range of every pixel of a reference panorama.
 
@@ -61,7 +63,9 @@ def sweep_range(
     to sample, compare and decide. `backend`: "numba", compiled; "numpy", the readable reference (the whole volume in
     memory); "opencv"; or the name of a plugin's. `device`: where a backend that can choose computes: "auto", "cpu",
     "cuda", "cuda:1". `reference_mask`: (H, W) False where the reference is to be ignored: NaN in the result.
-    `source_masks`: for each source (Hs, Ws), False where it is not valid, or None.
+    `source_masks`: for each source (Hs, Ws), False where it is not valid, or None. `planes`: (K, 3) vectors p
+    in the reference's frame, 1/range = p · ray, of planes that it may show; numba matches windows that lie on them too,
+    in semi-global matching, and prefers ranges that are not beyond them.
 
     Returns:
         Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
@@ -85,7 +89,7 @@ def sweep_range(
         reference_mask=reference_mask,
         source_masks=source_masks,
     )
-    winners = compute(work)
+    winners = compute(replace(work, planes=planes))
     seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
     seen = seen & sees_winner(winners, work)
     if settings.no_match == "invalid":

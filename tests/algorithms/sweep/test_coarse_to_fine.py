@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.coarse_to_fine import STEPS, GuidedSweep
+from pano_mvs.algorithms.sweep.coarse_to_fine import GuidedSweep
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
 from pano_mvs.algorithms.sweep.numba.arguments import (
     fresh_state,
@@ -30,6 +30,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_guided import (
     follow_guided_strip,
     split_layers,
 )
+from pano_mvs.algorithms.sweep.numba.slanted import STEPS
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError

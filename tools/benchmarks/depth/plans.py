@@ -197,10 +197,7 @@ def dense(chain: DenseChain, capture: Capture, *, width: int) -> Dense:
     path = SCRATCH / "plans" / f"{capture.name}_{width}_{chain.key()}_points.pkl"
     if not path.is_file():
         run = chain.run(capture, poses=with_true_points(true_poses(capture), capture.ranges))
-        planes = next(
-            (item for items in run.results.values() for item in items.values() if isinstance(item, Structure)), None
-        )
-        made = Dense(list(run.range_maps.values())[-1], planes, chain.fused(capture, run))
+        made = Dense(list(run.range_maps.values())[-1], run.planes, chain.fused(capture, run))
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(made))
     made = pickle.loads(path.read_bytes())

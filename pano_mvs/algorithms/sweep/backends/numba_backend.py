@@ -32,6 +32,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
 )
 from pano_mvs.algorithms.sweep.numba.kernels_sgm_rows import follow_rows
 from pano_mvs.algorithms.sweep.numba.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
+from pano_mvs.algorithms.sweep.numba.slanted import add_planes
 from pano_mvs.algorithms.sweep.numba.threads import Pool, run_jobs, workers
 from pano_mvs.algorithms.sweep.penalties import padded_channels, penalty_table, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
@@ -271,4 +272,5 @@ def _volume_of(work: SweepInput, sweep: Sweep, around: slice) -> NDArray[np.uint
     with workers() as pool:
         run_jobs(pool, sweep_rows, range(around.start, around.stop, BAND_ROWS))
     average_volume(volume, work, top=around.start)
+    add_planes(volume, work, sweep, top=around.start)
     return volume

@@ -145,6 +145,40 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
                     costs[j, k, i] = combined[i]
 
 
+@kernel
+def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
+    """Lower the costs of the planes among the candidates to what lies between the two candidates around each.
+
+    They rise by 10 for each plane from the guide, which decides where there is no texture.
+
+    `costs`: (rows, 2 steps + 1, W) at offsets from the guide. `guide`: (rows, W) positions among planes; −∞ where it
+    is not seen. `volume`: (rows, D, W) costs, lowered.
+    """
+    count, last = costs.shape[1], volume.shape[1] - 1
+    for j in range(guide.shape[0]):
+        for i in range(guide.shape[1]):
+            if guide[j, i] >= _F(0):
+                first = guide[j, i] - _F(count // 2)
+                start = int(np.ceil(first))
+                share = _F(start) - first
+                for k in range(count - 1):
+                    plane = start + k
+                    if 0 <= plane <= last:
+                        between = (_F(1) - share) * costs[j, k, i] + share * costs[j, k + 1, i]
+                        between += _F(10) * abs(_F(plane) - guide[j, i])
+                        volume[j, plane, i] = min(volume[j, plane, i], int(between + _F(0.5)))
+
+
+@kernel
+def raise_beyond(farthest: F32, volume: U8, row: int) -> None:
+    """Raise the costs of a row of a volume, (rows, D, W), beyond the farthest position among planes, (rows, W)."""
+    for d in range(volume.shape[1]):
+        for i in range(volume.shape[2]):
+            if _F(d) > farthest[row, i]:
+                # A chance match costs 127, a right one on texture a third of it. 20 and 80 did much the same.
+                volume[row, d, i] = min(volume[row, d, i] + 40, 255)
+
+
 _H = np.uint16
 
 PER_PLANE = 4
