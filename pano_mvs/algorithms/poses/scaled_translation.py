@@ -15,8 +15,8 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, es
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
-from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.correct_cameras import check_cameras
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings

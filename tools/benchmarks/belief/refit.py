@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.logistic import Model
-from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful
+from pano_mvs.algorithms.poses.verification.belief.doubts import is_doubtful
 from tools.benchmarks.belief.fitting import (
     PENALTY,
     SIGNS,

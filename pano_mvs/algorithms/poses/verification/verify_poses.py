@@ -10,9 +10,9 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST
-from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
+from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, check_cameras
 from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
+from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, check_cameras
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import TwoView
 

@@ -9,8 +9,8 @@ import pytest
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
-from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.correct_cameras import check_cameras, correct_cameras
 from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView

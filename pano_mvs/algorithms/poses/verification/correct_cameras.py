@@ -11,8 +11,8 @@ from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.resection import points_needed
 from pano_mvs.algorithms.poses.verification.aliases import other_arrangement
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
+from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence
-from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
 from pano_mvs.geometry import Rigid3

@@ -7,7 +7,7 @@ import pytest
 
 from pano_mvs.algorithms.logistic import Model, Term
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful, is_left_out, reason
+from pano_mvs.algorithms.poses.verification.belief.doubts import is_doubtful, is_left_out, reason
 
 BEST = {
     "ratio": 1.2,
