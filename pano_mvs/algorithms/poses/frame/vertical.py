@@ -76,7 +76,7 @@ def find_vertical(
             `pano_mvs.algorithms.poses.frame.upside_down`).
     """
     sensors, cameras = vertical_from_sensors(poses, up_in_cam or {}), vertical_from_cameras(poses)
-    prior = sensors if sensors and evidence == "auto" else cameras
+    prior = sensors if sensors and evidence in ("auto", "sensors") else cameras
     finders: dict[str, Callable[[], Vertical]] = {
         "sensors": lambda: sensors,
         "lines": lambda: _from_lines(poses, pictures or {}, prior),

@@ -289,6 +289,8 @@ def test_sensors_are_believed_against_the_pictures() -> None:
     pictures = {name: lambda: (np.ascontiguousarray(picture[::-1, ::-1]), valid) for name in poses.names}
     sensors = dict.fromkeys(poses.names, tuple(UP))
     assert angle_deg(find_vertical(poses, sensors, pictures).up_in_world, UP) < 1
-    vertical = find_vertical(turned_over(poses), dict.fromkeys(poses.names, tuple(-UP)), pictures)
+    over, sensors = turned_over(poses), dict.fromkeys(poses.names, tuple(-UP))
+    vertical = find_vertical(over, sensors, pictures)
     assert vertical.weights.keys() == {"sensors", "structure"}
     assert angle_deg(vertical.up_in_world, UP) < 1
+    assert find_vertical(over, sensors, evidence="sensors").weights == {"sensors": 1.0}
