@@ -142,6 +142,8 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
             f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
         )
     evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
+    if len(poses.names) == 1:
+        evidence = "the up direction of a single camera"
     uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), 1.0)
     return Vertical(up, "cameras", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
