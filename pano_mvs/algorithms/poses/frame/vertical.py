@@ -210,8 +210,8 @@ def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArra
     Returns:
         The mean (3,), the angle of every vector to it in degrees (N,), and which vectors are inliers (N,).
     """
-    angles = np.rad2deg(angle_between(directions[:, None], directions[None, :]))
-    mean = directions[int(np.argmin(angles.sum(axis=1)))]
+    # One after another: a table of the angles of 5,000 cameras would take 1.8 GB.
+    mean = min(directions, key=lambda each: np.rad2deg(angle_between(each, directions)).sum())
     for _ in range(2):
         deviations_deg = np.rad2deg(angle_between(directions, mean))
         # Agreement better than this rejects nothing: readings are tenths of degrees at best.
