@@ -6,6 +6,7 @@ A run copies files into the output folder after a stage has returned, so no stag
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
@@ -44,8 +45,9 @@ def exporter_tests(spec: StageSpec) -> dict[str, Callable[[StageCase], None]]:
 
 
 _OF_ONE_GROUP = (Photographs, Structure, TrackedPoints)
-# Characters with a meaning in XML, HTML, JSON, URLs or shells; blanks; a letter outside ASCII; a folder.
-_ODD_NAME = 'ä b/#{} "x" & <i>$0%20.png'
+# Characters with a meaning in XML, HTML, JSON, URLs or shells, as far as the system allows them in names of files;
+# blanks; a letter outside ASCII; a folder.
+_ODD_NAME = "ä b/#{} 'x' & $0%20.png" if os.name == "nt" else 'ä b/#{} "x" & <i>$0%20.png'
 _PARSERS: Mapping[str, Callable[[bytes], object]] = {
     ".json": json.loads,
     ".xml": ElementTree.fromstring,

@@ -305,7 +305,10 @@ BROKEN_BY = {
 
 
 @pytest.mark.parametrize("broken", BROKEN_BY, ids=lambda function: function.__name__)
-def test_a_stage_that_breaks_its_contract_is_caught(broken: Callable[..., Any]) -> None:
+def test_a_stage_that_breaks_its_contract_is_caught(
+    broken: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where one of them writes
     caught = []
     for contract_test in stage_contract_tests(broken):
         if broken is forces:  # it changes what it is given

@@ -463,6 +463,13 @@ def test_instructions_that_numba_must_not_use_are_left_unused(
     assert _lanes_of_this_machine() == lanes
 
 
+def test_without_avx_the_widest_registers_have_one_lane(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NUMBA_ENABLE_AVX=0 ended the process, too."""
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", None)
+    monkeypatch.setattr(numba.config, "ENABLE_AVX", 0)
+    assert _lanes_of_this_machine() <= 1
+
+
 @needs_vector
 @pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.x86.kernels_vector")
 @pytest.mark.parametrize("channels", [1, 3])

@@ -158,6 +158,14 @@ def test_a_source_that_disagrees_with_the_most_precise_one_has_no_weight() -> No
     assert vertical.uncertainty_deg == find_vertical(tilted, evidence="structure").uncertainty_deg
 
 
+def test_a_single_camera_is_held_nearly_upright() -> None:
+    tilted = with_points([Rigid3(rotation_from_rotvec([np.deg2rad(5.0), 0, 0]), np.zeros(3))], np.ones((3, 3)))
+    vertical = find_vertical(tilted)
+    assert vertical.evidence == "the up direction of a single camera"
+    assert 2 < vertical.uncertainty_deg < 3
+    assert angle_deg(vertical.up_in_world, UP) == pytest.approx(5)
+
+
 def test_cameras_held_at_random_tell_nothing() -> None:
     rng = np.random.default_rng(3)
     poses = with_points(
@@ -289,6 +297,8 @@ def test_sensors_are_believed_against_the_pictures() -> None:
     pictures = {name: lambda: (np.ascontiguousarray(picture[::-1, ::-1]), valid) for name in poses.names}
     sensors = dict.fromkeys(poses.names, tuple(UP))
     assert angle_deg(find_vertical(poses, sensors, pictures).up_in_world, UP) < 1
-    vertical = find_vertical(turned_over(poses), dict.fromkeys(poses.names, tuple(-UP)), pictures)
+    over, sensors = turned_over(poses), dict.fromkeys(poses.names, tuple(-UP))
+    vertical = find_vertical(over, sensors, pictures)
     assert vertical.weights.keys() == {"sensors", "structure"}
     assert angle_deg(vertical.up_in_world, UP) < 1
+    assert find_vertical(over, sensors, evidence="sensors").weights == {"sensors": 1.0}

@@ -10,11 +10,11 @@ from __future__ import annotations
 import re
 from typing import Any, Final
 
-import llvmlite.binding as llvm
 import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from pano_mvs.algorithms.sweep.kernels_constants import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
@@ -23,12 +23,11 @@ from pano_mvs.algorithms.sweep.kernels_constants import HALFWAY_ROUND, HALFWAY_S
 def features_of_this_machine() -> frozenset[str]:
     """Return the names of its instructions, as LLVM names them, for which numba compiles.
 
-    Those are the ones in NUMBA_CPU_FEATURES if that is set, and none beyond the baseline if NUMBA_CPU_NAME is generic.
-    Any other instruction would end the process when it is compiled.
+    Those are the ones in NUMBA_CPU_FEATURES if that is set, none beyond the baseline if NUMBA_CPU_NAME is generic, and
+    no AVX if NUMBA_ENABLE_AVX is 0. Any other instruction would end the process when it is compiled.
     """
-    if numba.config.CPU_FEATURES is not None:
-        return frozenset(re.findall(r"\+([^,\s]+)", numba.config.CPU_FEATURES))
-    return frozenset(name for name, present in llvm.get_host_cpu_features().items() if present)
+    stated = numba.config.CPU_FEATURES
+    return frozenset(re.findall(r"\+([^,\s]+)", get_host_cpu_features() if stated is None else stated))
 
 
 def _lanes_of_this_machine() -> int:
