@@ -160,7 +160,7 @@ def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Stru
     Only those are kept below which views see less than on them. Use it after poses.level: without known gravity, no
     plane is level.
     """
-    found = find_levels(poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng)
+    found = find_levels(poses, images, rng=ctx.rng)
     ctx.metric("planes", len(found))
     return found
 
