@@ -112,7 +112,7 @@ def sweep(
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
     must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
     edges are still better than at that one. With the floors of depth.levels, windows on these are matched too, and
-    ranges below them count less.
+    ranges below them count less, by the backend numba with semi-global matching.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
