@@ -112,7 +112,7 @@ def sweep(
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
     must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
     edges are still better than at that one. With the floors of depth.levels, windows on these are matched too, and
-    ranges below them count less.
+    ranges below them count less, by the backend numba with semi-global matching.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
@@ -160,7 +160,7 @@ def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Stru
     Only those are kept below which views see less than on them. Use it after poses.level: without known gravity, no
     plane is level.
     """
-    found = find_levels(poses, lambda name: images[name].load(), lambda name: images[name].load_mask(), rng=ctx.rng)
+    found = find_levels(poses, images, rng=ctx.rng)
     ctx.metric("planes", len(found))
     return found
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.cost_curve import CostCurve, cost_curve
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_input
 from pano_mvs.core.errors import UsageError
@@ -23,6 +24,7 @@ from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Panorama, Pose, RangeMap
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.depth import SweepParams
 
 
@@ -119,6 +121,7 @@ def inspect_pixel(
         reference_mask=masks[0],
         source_masks=masks[1:],
     )
+    has_floors = params.backend == "numba" and settings.aggregation == "sgm" and read.floors > 0
     curve = cost_curve(work, column=column, row=row, masked=not masks[0][row, column])
     ray = ray_from_pixel([column + 0.5, row + 0.5], (height, width))
     pose = read.poses[0]
@@ -139,7 +142,7 @@ def inspect_pixel(
         curve=curve,
         sources=_sights(curve, ray, read, pictures=pictures[1:], masks=masks[1:]),
         true_range=true_range,
-        notes=(*notes, *_curve_notes(unit, record, settings, curve=curve, stages=found)),
+        notes=(*notes, *_curve_notes(unit, record, settings, curve=curve, stages=found, has_floors=has_floors)),
     )
 
 
@@ -151,6 +154,7 @@ class _SweepRead:
     sources: tuple[Panorama, ...]
     names: tuple[str, ...]
     poses: tuple[Rigid3, ...]
+    floors: int  # known planes below the reference
 
     @staticmethod
     def of(unit: Unit, store: Store) -> _SweepRead:
@@ -158,8 +162,13 @@ class _SweepRead:
         near = unit.inputs["sources"]
         assert isinstance(near, dict)
         poses: list[Pose] = [values["pose"], *values["source_poses"]]
+        known: Structure | None = values["known"]
         return _SweepRead(
-            values["ref"], tuple(values["sources"]), tuple(near), tuple(pose.cam_from_world for pose in poses)
+            values["ref"],
+            tuple(values["sources"]),
+            tuple(near),
+            tuple(pose.cam_from_world for pose in poses),
+            0 if known is None else len(planes_before(known, poses[0].cam_from_world, poses[0].group)),
         )
 
     @property
@@ -256,7 +265,13 @@ def _true_range(
 
 
 def _curve_notes(
-    unit: Unit, record: UnitRecord | None, settings: SweepSettings, *, curve: CostCurve, stages: Sequence[StageRange]
+    unit: Unit,
+    record: UnitRecord | None,
+    settings: SweepSettings,
+    *,
+    curve: CostCurve,
+    stages: Sequence[StageRange],
+    has_floors: bool,
 ) -> tuple[str, ...]:
     notes = []
     name = unit.entry.name
@@ -270,6 +285,8 @@ def _curve_notes(
             f"{name} goes from coarse to fine (levels: {settings.levels}) and tests a few ranges around a "
             "guide; the curve tests all"
         )
+    if has_floors:
+        notes.append(f"{name} also compares windows on known floors; the curve shows those that face the camera")
     stored = next((found for found in stages if found.stage == name), None)
     if stored is not None and not _alike(stored.range, curve):
         notes.append(f"{name} stored {stored.range:.6g}, the curve's winner is {curve.range:.6g}")

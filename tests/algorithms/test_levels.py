@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from pano_mvs.algorithms.structure.levels import find_levels
 from pano_mvs.algorithms.structure.planes import find_floors
 from pano_mvs.algorithms.structure.view import PlaneView
+from pano_mvs.algorithms.sweep.numba.arguments import sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_guided import lower_at_candidates, raise_beyond
+from pano_mvs.algorithms.sweep.numba.slanted import add_planes
 from pano_mvs.algorithms.sweep.preparation import planes_before
-from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
+from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, rotation_from_rotvec
-from pano_mvs.scene import Poses
+from pano_mvs.scene import FilePart, Panorama, Poses
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.range_scenes import TRUSTED, box_range
@@ -34,23 +39,32 @@ def _room() -> tuple[list[Picture], list[Rigid3], list[NDArray[np.float32]]]:
     return [picture for picture, _ in views], poses, [truth for _, truth in views]
 
 
-def _levels(frame: str) -> Structure:
+def _levels(frame: str, folder: Path, missing: int = 0) -> Structure:
     pictures, cameras, _ = _room()
     named = {f"{idx}.png": picture for idx, picture in enumerate(pictures)}
     poses = Poses.without_points(dict(zip(named, cameras, strict=True)), frame=frame, scale="", metric=True)
-    return find_levels(poses, named.__getitem__, lambda _: np.ones(SIZE, np.bool_), rng=np.random.default_rng(0))
+    images = {}
+    for name, picture in list(named.items())[missing:]:
+        Image.fromarray(picture).save(folder / name)
+        images[name] = Panorama(FilePart(folder / name), SIZE, SIZE)
+    return find_levels(poses, images, rng=np.random.default_rng(0))
 
 
-def test_the_floor_is_found_in_small_sweeps() -> None:
-    found = _levels("y down")
+def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
+    found = _levels("y down", tmp_path)
     heights = found.offsets * found.normals_in_world[:, 1]
     assert np.abs(heights - FLOOR).min() < 0.03 * FLOOR
     assert (found.normals_in_world[:, 1] < 0).all()
     assert heights.max() < 1.05 * FLOOR
 
 
-def test_without_known_gravity_nothing_is_level() -> None:
-    assert len(_levels("the first camera")) == 0
+def test_views_without_an_image_are_left_out(tmp_path: Path) -> None:
+    assert len(_levels("y down", tmp_path, missing=1)) >= 1
+    assert len(_levels("y down", tmp_path, missing=3)) == 0
+
+
+def test_without_known_gravity_nothing_is_level(tmp_path: Path) -> None:
+    assert len(_levels("the first camera", tmp_path)) == 0
 
 
 def test_planes_before_a_camera_give_the_ranges_of_its_rays() -> None:
@@ -121,6 +135,20 @@ def test_windows_on_the_floor_find_it_where_others_do_not() -> None:
     without, with_floor = (np.abs(_swept(planes) / truth - 1) for planes in (None, np.array([[0.0, 1 / FLOOR, 0.0]])))
     assert (with_floor < 0.05)[floor].mean() > (without < 0.05)[floor].mean() + 0.2
     assert (with_floor < 0.05).mean() > (without < 0.05).mean() + 0.05
+
+
+def test_a_floor_bounds_no_ray_that_meets_a_lower_one_beyond_all_hypotheses() -> None:
+    """Towards the horizon, rays meet the upper floor within the last hypothesis, and the lower one beyond it."""
+    picture = np.full((*SIZE, 3), 128, np.uint8)
+    planes = np.array([[0, 1 / 1.6, 0], [0, 1 / 4.6, 0]])
+    settings = SweepSettings(planes=128)
+    work = sweep_input(picture, [picture], [_far_apart()[1][0]], near=0.4, far=20.0, settings=settings)
+    volume = np.zeros((SIZE[0], 128, SIZE[1]), np.uint8)
+    add_planes(volume, replace(work, planes=planes), sweep_arguments(work), top=0)
+    down = ray_grid(SIZE)[:, 0, 1]
+    raised = volume[:, -1, 0] > 0
+    assert raised[down > 0.9].all()
+    assert not raised[down < 4.6 / 20].any()
 
 
 def test_no_plane_changes_nothing() -> None:

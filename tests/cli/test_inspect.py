@@ -145,6 +145,16 @@ def test_a_sweep_from_coarse_to_fine_says_that_it_tried_less(run: Path) -> None:
     assert any("tests a few ranges around a guide" in note for note in found["notes"])
 
 
+def test_a_sweep_with_floors_says_that_it_compared_more(run: Path) -> None:
+    levelled = "  levelled: {use: poses.level, evidence: cameras}\n  levels: {use: depth.levels}\n  views: "
+    (run / "floors.yaml").write_text(WORKFLOW.replace("  views: ", levelled))
+    outcome = call("run", run / "floors.yaml", "--out", run / "floors", "--cache", run / "cache")
+    assert outcome.code == 0, outcome.text
+    found = inspected(run / "floors", "000", 40, 28)
+    assert "windows on known floors" in found["notes"][0]
+    assert inspected(run / "floors", "000", 40, 28, "--stage", "boxed")["notes"] == []
+
+
 def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> None:
     plot = tmp_path / "plots" / "curve.png"
     outcome = call("inspect", run / "out", "000.png", 40, 28, "--plot", plot)

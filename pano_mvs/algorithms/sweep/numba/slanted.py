@@ -34,7 +34,7 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
 
     `volume`: (rows, D, W) costs, changed. `top`: the first of these rows.
     """
-    if work.planes is None:
+    if work.planes is None or not len(work.planes):
         return
     height, width = work.reference.shape[:2]
     halo = work.settings.compare_radius + work.settings.box_radius
@@ -44,7 +44,7 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
         inverse = rays @ plane
         met = inverse > table[-1]
         position = np.interp(-inverse, -table.astype(np.float64), np.arange(len(table)) / TABLE_PER_PLANE)
-        farthest = np.maximum(farthest, np.where(met, position + STEPS, 0)).astype(np.float32)
+        farthest = np.maximum(farthest, np.where(met, position + STEPS, np.inf)).astype(np.float32)
         guide = pad_panorama(position.astype(np.float32), halo)[:, halo:-halo]
 
         def match(first: int, *, guide: NDArray[np.float32] = guide, met: NDArray[np.bool_] = met) -> None:
@@ -59,6 +59,5 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
 
         with workers() as pool:
             run_jobs(pool, match, range(top, top + len(volume), BAND_ROWS))
-    farthest[farthest == 0] = np.inf
     with workers() as pool:
         run_jobs(pool, partial(raise_beyond, farthest[top : top + len(volume)], volume), range(len(volume)))
