@@ -20,7 +20,7 @@ from pano_mvs.algorithms.patchmatch.full_size import (
 )
 from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_at_scale, refine_plain_surfaces, refine_range
 from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, ranges_of_levels, reduced, sharp_halvings
-from pano_mvs.algorithms.structure.levels import find_levels
+from pano_mvs.algorithms.structure.floors import floors_of_groups
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.preparation import planes_before
@@ -111,7 +111,7 @@ def sweep(
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
     must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
-    edges are still better than at that one. With the floors of depth.levels, windows on these are matched too, and
+    edges are still better than at that one. With the floors of depth.floors, windows on these are matched too, and
     ranges below them count less, by the backend numba with semi-global matching.
     """
     require_one_group(pose, source_poses)
@@ -153,14 +153,14 @@ def sweep(
     return range_map
 
 
-@stage("depth.levels")
-def known_levels(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
+@stage("depth.floors")
+def known_floors(poses: One[Poses], images: All[Panorama], ctx: Context) -> Structure:
     """Find floors before the sweep, in small sweeps of all views.
 
     Only those are kept below which views see less than on them. Use it after poses.level: without known gravity, no
     plane is level.
     """
-    found = find_levels(poses, images, rng=ctx.rng)
+    found = floors_of_groups(poses, images, rng=ctx.rng)
     ctx.metric("planes", len(found))
     return found
 

@@ -146,7 +146,7 @@ def test_a_sweep_from_coarse_to_fine_says_that_it_tried_less(run: Path) -> None:
 
 
 def test_a_sweep_with_floors_says_that_it_compared_more(run: Path) -> None:
-    levelled = "  levelled: {use: poses.level, evidence: cameras}\n  levels: {use: depth.levels}\n  views: "
+    levelled = "  levelled: {use: poses.level, evidence: cameras}\n  floors: {use: depth.floors}\n  views: "
     (run / "floors.yaml").write_text(WORKFLOW.replace("  views: ", levelled))
     outcome = call("run", run / "floors.yaml", "--out", run / "floors", "--cache", run / "cache")
     assert outcome.code == 0, outcome.text

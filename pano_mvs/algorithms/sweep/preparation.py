@@ -27,11 +27,11 @@ from pano_mvs.scene.surfaces import Structure
 _ROWS_AT_ONCE = 256
 
 
-def planes_before(levels: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
+def planes_before(known: Structure, cam_from_world: Rigid3, group: int) -> FloatArray:
     """Return the planes whose front a camera sees as (K, 3) vectors p in its frame, 1/range = p · ray."""
-    heights = levels.offsets - levels.normals_in_world @ cam_from_world.center
-    seen = (levels.group_idx == group) & (heights < 0)
-    return np.asarray(levels.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
+    heights = known.offsets - known.normals_in_world @ cam_from_world.center
+    seen = (known.group_idx == group) & (heights < 0)
+    return np.asarray(known.normals_in_world[seen] @ cam_from_world.rotation.T / heights[seen, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,8 @@ def read_with_neighbours(data: bytes, suffix: str) -> None:
             refused = item.problem
             assert not refused or item.name.startswith("b.")
             if not refused:
-                assert 0 <= folder_memory_bytes(params, {"item": item}) < 1 << 30
+                # A header may state as many pixels as are allowed.
+                assert 0 <= folder_memory_bytes(params, {"item": item}) < params.max_megapixels * 1e6 * 16
                 (capture / f".{item.name}").mkdir()
                 try:
                     made = folder(item, params, Context(np.random.default_rng(0), capture / f".{item.name}"))

@@ -170,13 +170,27 @@ def lower_at_candidates(costs: U8, guide: F32, volume: U8) -> None:
 
 
 @kernel
-def raise_beyond(farthest: F32, volume: U8, row: int) -> None:
-    """Raise the costs of a row of a volume, (rows, D, W), beyond the farthest position among planes, (rows, W)."""
-    for d in range(volume.shape[1]):
-        for i in range(volume.shape[2]):
-            if _F(d) > farthest[row, i]:
-                # A chance match costs 127, a right one on texture a third of it. 20 and 80 did much the same.
-                volume[row, d, i] = min(volume[row, d, i] + 40, 255)
+def raise_beyond(farthest: F32, half_width: I64, volume: U8, row: int) -> None:
+    """Raise the costs of a row of a volume, (rows, D, W), beyond the farthest position among planes, (rows, W).
+
+    A ray is left as it is if most rays up to `half_width`, (rows,) columns, on either side of it match better beyond:
+    there is a hole in the floor.
+    """
+    count, width = volume.shape[1:]
+    better = np.zeros(width, np.int32)
+    for i in range(width):
+        if farthest[row, i] < _F(count):
+            least = volume[row, :, i].argmin()
+            better[i] = _F(least) > farthest[row, i]
+    half = half_width[row]
+    around = better[-half:].sum() + better[: half + 1].sum()
+    for i in range(width):
+        if 2 * around <= 2 * half + 1:
+            for d in range(count):
+                if _F(d) > farthest[row, i]:
+                    # A chance match costs 127, a right one on texture a third of it. 20 and 80 did much the same.
+                    volume[row, d, i] = min(volume[row, d, i] + 40, 255)
+        around += better[(i + half + 1) % width] - better[(i - half) % width]
 
 
 _H = np.uint16

@@ -59,5 +59,8 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
 
         with workers() as pool:
             run_jobs(pool, match, range(top, top + len(volume), BAND_ROWS))
+    # 5° of arc.
+    half_width = np.clip(width / 72 / np.hypot(rays[:, 0, 0], rays[:, 0, 2]), 1, (width - 1) // 2).astype(np.int64)
+    rows = slice(top, top + len(volume))
     with workers() as pool:
-        run_jobs(pool, partial(raise_beyond, farthest[top : top + len(volume)], volume), range(len(volume)))
+        run_jobs(pool, partial(raise_beyond, farthest[rows], half_width[rows], volume), range(len(volume)))

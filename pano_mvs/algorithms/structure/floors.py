@@ -21,7 +21,7 @@ from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
 
 
-def find_levels(poses: Poses, images: Mapping[str, Panorama], *, rng: np.random.Generator) -> Structure:
+def floors_of_groups(poses: Poses, images: Mapping[str, Panorama], *, rng: np.random.Generator) -> Structure:
     """Return the floors that bound what the views of each group see, and no other planes.
 
     A group of poses whose frame does not state that y points down along gravity has none.
@@ -37,7 +37,7 @@ def find_levels(poses: Poses, images: Mapping[str, Panorama], *, rng: np.random.
         seen = with_cameras(group, np.array([name in images for name in group.names], np.bool_))
         near = select_views(seen, sources=4).neighbours
         if near and states_y_down(group.frame):
-            planes += _levels_of(seen, near, images, rng=rng)
+            planes += _floors_of(seen, near, images, rng=rng)
             groups += [number] * (len(planes) - len(groups))
     return Structure(
         np.array([plane.normal for plane in planes]).reshape(-1, 3),
@@ -47,7 +47,7 @@ def find_levels(poses: Poses, images: Mapping[str, Panorama], *, rng: np.random.
     )
 
 
-def _levels_of(
+def _floors_of(
     group: Poses, near: Mapping[str, Sequence[str]], images: Mapping[str, Panorama], *, rng: np.random.Generator
 ) -> list[ScenePlane]:
     """Return the planes of one group; `near`: the sources of its views, each of which is a view itself."""

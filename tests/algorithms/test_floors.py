@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from pano_mvs.algorithms.structure.levels import find_levels
+from pano_mvs.algorithms.structure.floors import floors_of_groups
 from pano_mvs.algorithms.structure.planes import find_floors
 from pano_mvs.algorithms.structure.view import PlaneView
 from pano_mvs.algorithms.sweep.numba.arguments import sweep_arguments
@@ -39,7 +39,7 @@ def _room() -> tuple[list[Picture], list[Rigid3], list[NDArray[np.float32]]]:
     return [picture for picture, _ in views], poses, [truth for _, truth in views]
 
 
-def _levels(frame: str, folder: Path, missing: int = 0) -> Structure:
+def _floors(frame: str, folder: Path, missing: int = 0) -> Structure:
     pictures, cameras, _ = _room()
     named = {f"{idx}.png": picture for idx, picture in enumerate(pictures)}
     poses = Poses.without_points(dict(zip(named, cameras, strict=True)), frame=frame, scale="", metric=True)
@@ -47,11 +47,11 @@ def _levels(frame: str, folder: Path, missing: int = 0) -> Structure:
     for name, picture in list(named.items())[missing:]:
         Image.fromarray(picture).save(folder / name)
         images[name] = Panorama(FilePart(folder / name), SIZE, SIZE)
-    return find_levels(poses, images, rng=np.random.default_rng(0))
+    return floors_of_groups(poses, images, rng=np.random.default_rng(0))
 
 
 def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
-    found = _levels("y down", tmp_path)
+    found = _floors("y down", tmp_path)
     heights = found.offsets * found.normals_in_world[:, 1]
     assert np.abs(heights - FLOOR).min() < 0.03 * FLOOR
     assert (found.normals_in_world[:, 1] < 0).all()
@@ -59,30 +59,30 @@ def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
 
 
 def test_views_without_an_image_are_left_out(tmp_path: Path) -> None:
-    assert len(_levels("y down", tmp_path, missing=1)) >= 1
-    assert len(_levels("y down", tmp_path, missing=3)) == 0
+    assert len(_floors("y down", tmp_path, missing=1)) >= 1
+    assert len(_floors("y down", tmp_path, missing=3)) == 0
 
 
 def test_without_known_gravity_nothing_is_level(tmp_path: Path) -> None:
-    assert len(_levels("the first camera", tmp_path)) == 0
+    assert len(_floors("the first camera", tmp_path)) == 0
 
 
 def test_planes_before_a_camera_give_the_ranges_of_its_rays() -> None:
     _, cameras, _ = _room()
-    levels = Structure(
+    floors = Structure(
         np.array([[0, -1.0, 0], [0, 1.0, 0], [0, -1.0, 0]]),
         np.array([-FLOOR, CEILING, 2.0]),  # the last one is above all cameras, which are behind it
         np.full(3, 0.02),
         np.zeros(3, np.int32),
     )
     camera = cameras[1]
-    planes = planes_before(levels, camera, 0)
+    planes = planes_before(floors, camera, 0)
     assert planes.shape == (2, 3)
     rays = ray_grid(SIZE)
     inverse = (rays @ planes.T).max(axis=-1)
     points = camera.inverse().apply(rays / inverse[..., None])
     assert np.allclose(np.where(points[..., 1] > 0, points[..., 1] - FLOOR, points[..., 1] - CEILING), 0, atol=1e-9)
-    assert len(planes_before(levels, camera, 1)) == 0
+    assert len(planes_before(floors, camera, 1)) == 0
 
 
 def _view(ranges: NDArray[np.float32], center: Sequence[float]) -> PlaneView:
@@ -155,7 +155,7 @@ def test_no_plane_changes_nothing() -> None:
     np.testing.assert_array_equal(_swept(None), _swept(np.zeros((0, 3))))
 
 
-def test_kernels_lower_costs_at_candidates_and_raise_those_beyond() -> None:
+def test_costs_are_lowered_at_candidates() -> None:
     rng = np.random.default_rng(0)
     rows, planes, width = 3, 9, 5
     volume = rng.integers(0, 256, (rows, planes, width)).astype(np.uint8)
@@ -171,8 +171,25 @@ def test_kernels_lower_costs_at_candidates_and_raise_those_beyond() -> None:
     lowered = volume.copy()
     lower_at_candidates(costs, guide, lowered)
     np.testing.assert_array_equal(lowered, expected)
-    raised = lowered.copy()
+
+
+def test_costs_beyond_a_floor_rise_but_where_most_rays_match_better_there() -> None:
+    rng = np.random.default_rng(0)
+    rows, planes, width = 3, 9, 40
+    volume = rng.integers(0, 256, (rows, planes, width)).astype(np.uint8)
+    farthest = rng.uniform(2, planes, (rows, width)).astype(np.float32)
+    volume[1, -1, 12:24], farthest[1, 12:24] = 0, 5  # a hole
+    half_width = np.array([1, 3, 19])
+    raised = volume.copy()
     for row in range(rows):
-        raise_beyond(guide + np.float32(3), raised, row)
-    beyond = np.arange(planes)[:, None] > guide[:, None] + np.float32(3)
-    np.testing.assert_array_equal(raised, np.where(beyond, np.minimum(lowered.astype(int) + 40, 255), lowered))
+        raise_beyond(farthest, half_width, raised, row)
+    better = volume.argmin(1) > farthest
+    expected = volume.copy()
+    for j, i in np.ndindex(rows, width):
+        half = int(half_width[j])
+        around = better[j, np.arange(i - half, i + half + 1) % width]
+        if around.mean() <= 0.5:
+            beyond = np.arange(planes) > farthest[j, i]
+            expected[j, beyond, i] = np.minimum(volume[j, beyond, i].astype(int) + 40, 255)
+    np.testing.assert_array_equal(raised, expected)
+    np.testing.assert_array_equal(raised[1, :, 14:22], volume[1, :, 14:22])
