@@ -14,7 +14,7 @@ class XyzParams(Params):
 
 @stage("export.xyz")
 def xyz(cloud: One[PointCloud], params: XyzParams, ctx: Context) -> Files:
-    """The cloud as cloud.xyz: a line for each point, x y z red green blue.
+    """The cloud as cloud.xyz: a line for each point, x y z in the world frame, red green blue.
 
     Points of panoramas that nothing connects with the others have a frame of their own, and so a file: cloud_1.xyz …
     """
