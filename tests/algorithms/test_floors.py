@@ -6,6 +6,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -123,16 +124,18 @@ def _far_apart() -> tuple[list[Picture], list[Rigid3], NDArray[np.float32]]:
     return [picture for picture, _ in views], poses[1:], views[0][1]
 
 
-def _swept(planes: FloatArray | None) -> NDArray[np.float32]:
+def _swept(planes: FloatArray | None, **chosen: Any) -> NDArray[np.float32]:
     pictures, poses, _ = _far_apart()
-    settings = SweepSettings(planes=64, no_match="keep")
+    settings = SweepSettings(planes=64, no_match="keep", **chosen)
     return sweep_range(pictures[0], pictures[1:], poses, near=0.4, far=6.0, settings=settings, planes=planes).range
 
 
-def test_windows_on_the_floor_find_it_where_others_do_not() -> None:
+@pytest.mark.parametrize("chosen", [{}, {"cost": "sad", "window": 1}], ids=["census", "single pixels"])
+def test_windows_on_the_floor_find_it_where_others_do_not(chosen: dict[str, Any]) -> None:
     truth = _far_apart()[2]
     floor = np.abs(truth * ray_grid(SIZE)[..., 1] - FLOOR) < 1e-3
-    without, with_floor = (np.abs(_swept(planes) / truth - 1) for planes in (None, np.array([[0.0, 1 / FLOOR, 0.0]])))
+    known = np.array([[0.0, 1 / FLOOR, 0.0]])
+    without, with_floor = (np.abs(_swept(planes, **chosen) / truth - 1) for planes in (None, known))
     assert (with_floor < 0.05)[floor].mean() > (without < 0.05)[floor].mean() + 0.2
     assert (with_floor < 0.05).mean() > (without < 0.05).mean() + 0.05
 

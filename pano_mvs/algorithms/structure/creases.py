@@ -286,8 +286,8 @@ def _adjust(
             which = np.array([column[one] for one in level], np.int64)
             rows[np.arange(len(rows)), which] = derivatives[:, 2] * scales[which]
             weight = np.minimum(contrast / CLEAR_LEVELS, 1.0) / _PIECE_RAD**2
-            # Skirting boards, cornices and their shadows are edges off the planes. With 0.005 of the level distance,
-            # most walls of eight rendered places were within 1 % of the truth, of 0.003, 0.005, 0.007 and 0.01.
+            # Skirting boards, cornices and their shadows are edges off the planes. On nine runs of rendered
+            # places, 0.005 of the level distance was compared with 0.003 and 0.01, and on four of them with 0.007.
             aside = derivatives[:, 0] / placement.distance
             edge = 0.005 * scales[which][:, None] * np.column_stack([derivatives[:, 2], aside])
             for one in np.unique(which):

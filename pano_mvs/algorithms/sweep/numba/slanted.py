@@ -45,7 +45,7 @@ def add_planes(volume: NDArray[np.uint8], work: SweepInput, sweep: Sweep, *, top
         met = inverse > table[-1]
         position = np.interp(-inverse, -table.astype(np.float64), np.arange(len(table)) / TABLE_PER_PLANE)
         farthest = np.maximum(farthest, np.where(met, position + STEPS, np.inf)).astype(np.float32)
-        guide = pad_panorama(position.astype(np.float32), halo)[:, halo:-halo]
+        guide = pad_panorama(position.astype(np.float32), halo)[:, halo : halo + width]
 
         def match(first: int, *, guide: NDArray[np.float32] = guide, met: NDArray[np.bool_] = met) -> None:
             rows = min(BAND_ROWS, top + len(volume) - first)
