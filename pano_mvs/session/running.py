@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.algorithms.filters.consistency import Agreement, view_doubts
+from pano_mvs.algorithms.filters.consistency import Agreement, evidence_of_views
+from pano_mvs.algorithms.poses.verification.belief.doubts import with_later_evidence
 from pano_mvs.core.errors import InputError, PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.memory import bytes_from_size
@@ -28,6 +28,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted
 from pano_mvs.session.session import Session, check_output
@@ -190,18 +191,13 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
     Raises:
         StoreError: if a file cannot be written; run.json is written first.
     """
-    poses = latest(run, Poses)
-    stage = _compared_stage(run)
+    poses, stage = _judged_poses(run)
     if poses is not None and stage:
-        name, figures = stage
-        groups, centers = poses.groups, poses.centers
-        for group in range(len(poses.worlds)):
-            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
-            for image, reason in view_doubts(figures, inside).items():
-                run.result.doubts.setdefault(image, (name, reason))
+        for image in poses.doubts.keys() - run.result.doubts.keys():
+            run.result.doubts[image] = stage, poses.doubts[image]
     if run.result.doubts and run.result.exit_code == 0:
         run.result.exit_code = FAILED_ITEMS
-    summary = summarise(run, started=started, seconds=time.perf_counter() - clock)
+    summary = summarise(run, poses, started=started, seconds=time.perf_counter() - clock)
     values = StoredValues.of_run(run, summary.results)
     try:
         report = gather_report(run.out, summary, values)
@@ -230,18 +226,22 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
 _FIGURES = tuple(Agreement.__dataclass_fields__)
 
 
-def _compared_stage(run: Run) -> tuple[str, Mapping[str, Agreement]] | None:
-    """Return the last stage of the range maps that compared the views, and what it found of each."""
+def _judged_poses(run: Run) -> tuple[Poses | None, str]:
+    """Return the poses of a run, judged by the last range maps that were compared, too, and the stage of these."""
+    poses = latest(run, Poses)
     metrics = {summary.stage: summary.unit_metrics for summary in run.result.stages}
     for name in reversed(chain_of(run.workflow, run.graph, RangeMap)):
-        found = {
+        agreements = {
             view: Agreement(*(values[figure] for figure in _FIGURES))
             for view, values in metrics.get(name, {}).items()
             if all(figure in values for figure in _FIGURES)
         }
-        if found:
-            return name, found
-    return None
+        if agreements and poses is not None:
+            found: dict[str, tuple[float, str]] = {}
+            for group in split_groups(poses):
+                found |= evidence_of_views(agreements, dict(zip(group.names, group.centers, strict=True)))
+            return with_later_evidence(poses, found), name
+    return poses, ""
 
 
 def min_free_bytes(size: str = "") -> int:

@@ -48,11 +48,12 @@ from pano_mvs.scene.upright import mean_up_direction, world_up, z_up_from_world
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
 
 
-def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
+def summarise(run: Run, poses: Poses | None, *, started: datetime, seconds: float) -> RunSummary:
     """Return the summary of a run, finished or not, without a verdict.
 
     Args:
         run: after `execute`, also if it raised.
+        poses: its cameras as they are judged in the end; None without any.
     """
     workflow, result = run.workflow, run.result
     scores = _scores(run)
@@ -60,7 +61,7 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause) for failure in result.blocked
     )
     results = final_stages(run)
-    poses = _poses(run, blocked)
+    posed = _poses(run, poses, blocked)
     return RunSummary(
         workflow=WorkflowSummary(
             name=workflow.name,
@@ -85,9 +86,9 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
         warnings=tuple(result.warnings),
-        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(poses)),
+        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(posed)),
         results=results,
-        poses=poses,
+        poses=posed,
         scores=next(iter(scores.values()), ScoresSummary()),
         all_scores=scores if len(scores) > 1 else {},
         views=_views(run, results.get("ranges", "")),
@@ -122,8 +123,8 @@ def _reasons(found: Mapping[str, tuple[str, str]]) -> dict[str, ImageReason]:
     return {image: ImageReason(stage=stage, reason=reason) for image, (stage, reason) in found.items()}
 
 
-def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
-    poses, result = latest(run, Poses), run.result
+def _poses(run: Run, poses: Poses | None, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
+    result = run.result
     if poses is None:
         return PosesSummary()
     cloud = latest(run, PointCloud)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -14,6 +13,7 @@ from pano_mvs.algorithms.poses.adjustment.refine import fitted_elevation_range, 
 from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
 from pano_mvs.algorithms.poses.loop_closures import find_false_closures
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.algorithms.poses.verification.belief.doubts import with_later_evidence
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.api import (
@@ -175,10 +175,7 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
 
 
 def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, ctx: Context) -> Poses:
-    """Return refined poses whose cameras are doubtful if their panoramas do not cover the full sphere.
-
-    What was measured of such cameras is for full spheres, so they have no probability to be right.
-    """
+    """Return refined poses whose cameras are hardly right if their panoramas do not cover the full sphere."""
     settings = arguments_from(refine_poses, params)
     found = fitted_elevation_range(poses, refined, loss=settings["loss"], loss_scale_deg=settings["loss_scale_deg"])
     if found is None or found.is_full:
@@ -190,8 +187,8 @@ def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, c
         "metadata"
     )
     ctx.note(reason)
-    doubts = {name: refined.doubts.get(name, reason) for name in refined.names}
-    return replace(refined, doubts=doubts, right_probabilities=None)
+    # The range differs from the full one by more than three standard deviations.
+    return with_later_evidence(refined, dict.fromkeys(refined.names, (float(np.exp(-(3.0**2) / 2)), reason)))
 
 
 class FromModelParams(Params):

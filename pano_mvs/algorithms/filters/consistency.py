@@ -40,15 +40,25 @@ class Agreement:
         return self.seen_through + self.hidden
 
 
-def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
-    """Return the views with doubtful poses, with the reason.
+_LOOKS_RIGHT = 0.01
+"""How often a right camera looks like one whose ranges other views contradict; none of those that were measured did."""
 
-    A view is doubtful if its sources agree with a much smaller share of its ranges than is usual for the views around
-    it, and if they contradict most of the rest in one direction. Matching errors scatter; a wrong pose moves
-    everything.
 
-    `agreements`: view name to agreement. `centers`: (3,) camera centres of the views of one world frame; views without
-    one are not judged.
+def evidence_of_views(
+    agreements: Mapping[str, Agreement], centers: Mapping[str, NDArray[np.float64]]
+) -> dict[str, tuple[float, str]]:
+    """Return the views whose sources speak against their poses, with a likelihood ratio and what it rests on.
+
+    The sources agree with a much smaller share of the ranges of such a view than is usual for the views around it, and
+    contradict most of the rest in one direction. Matching errors scatter; a wrong pose moves everything.
+
+    Args:
+        agreements: view name to agreement.
+        centers: (3,) camera centres of the views of one world frame; views without one are not judged.
+
+    Returns:
+        View name to the likelihood of this if its pose is right, relative to that if it is wrong, and a sentence. Views
+        without anything against them are left out.
     """
     # If little can be compared, or neighbours agree with no view either, nothing can be concluded.
     names = [name for name in agreements if name in centers and agreements[name].compared >= 0.2]
@@ -56,7 +66,7 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
         return {}
     places = np.array([centers[name] for name in names])
     agreed = np.array([agreements[name].agreed for name in names])
-    doubts = {}
+    found = {}
     for idx, (name, around) in enumerate(zip(names, nearest_views(places), strict=True)):
         usual = float(np.median(agreed[around]))
         one_way = agreements[name].one_way
@@ -65,11 +75,12 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
         # metre off had at most 0.47. Contradictions in one direction are not sufficient alone (cameras with true poses
         # had at most 0.62, cameras half a metre off 0.63 or more): they exclude views whose errors scatter.
         if usual >= 0.1 and agreed[idx] < 0.55 * usual and one_way >= 0.55:
-            doubts[name] = (
+            found[name] = (
+                _LOOKS_RIGHT,
                 f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: {100 * usual:.0f} "
-                f"%) and contradict {100 * one_way:.0f} % in one direction"
+                f"%) and contradict {100 * one_way:.0f} % in one direction",
             )
-    return doubts
+    return found
 
 
 def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:

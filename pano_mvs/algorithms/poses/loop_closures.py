@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.scaled_translation import solved_models
+from pano_mvs.algorithms.poses.solved_models import solved_models
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.scene import Features, TwoView
 

@@ -9,18 +9,15 @@ from typing import Annotated
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import no_poses, normalised_poses
-from pano_mvs.algorithms.poses.growth import grown_model, settle
-from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
-from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import why_no_pair
-from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
+from pano_mvs.algorithms.poses.solved_models import solved_models
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import check_cameras
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
 
@@ -75,31 +72,6 @@ def solve_scaled_translation(
     if not groups:
         return no_poses(rejected)
     return join_groups(groups, order=names, rejected=rejected)
-
-
-def solved_models(pairs: Pairs, *, adjust: bool = True) -> tuple[list[PlacedModel], dict[int, str]]:
-    """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
-
-    Images that could not be added to any model are tried as models of one camera when models are joined.
-    """
-    grown: list[PlacedModel] = []
-    reasons: dict[int, str] = {}
-    waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
-    while waiting:
-        model, refused = grown_model(pairs, waiting.pop(0), adjust=adjust)
-        grown.append(model)
-        reasons |= refused
-        left = {edge for edge in pairs.geometries if edge[0] in refused and edge[1] in refused}
-        waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
-    placed = {image for model in grown for image in model.cameras}
-    alone = [PlacedModel(pairs, {image: Rigid3.identity()}) for image in range(len(pairs.names)) if image not in placed]
-    found: list[PlacedModel] = []
-    for model, numbers in join_models([*grown, *alone]) if grown else []:
-        if len(numbers) > 1:
-            settle(model, adjust=adjust)
-        if len(model.cameras) > 1:
-            found.append(model)
-    return sorted(found, key=lambda model: (-len(model.cameras), min(model.cameras))), reasons
 
 
 def _finished(model: PlacedModel, *, adjust: bool) -> Poses:

@@ -24,6 +24,7 @@ from pano_mvs.algorithms.blocks import (
     camera_spacing,
     merge_blocks,
 )
+from pano_mvs.algorithms.poses.verification.belief.doubts import probability_of, with_later_evidence
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.file_names import PAIR_SEPARATOR
@@ -96,8 +97,7 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     merged = merge_blocks([block.poses for block in blocks], similarities, order=order, reference=reference)
     if all(any(stage.use == _ADJUSTS for stage in block.run.summary.stages) for block in blocks):
         merged = adjust_merged(merged)
-    doubts = camera_doubts(blocks, alignment)
-    merged = replace(merged, poses=replace(merged.poses, doubts={**merged.poses.doubts, **doubts}))
+    merged = replace(merged, poses=with_later_evidence(merged.poses, evidence_of_blocks(blocks, alignment)))
     to.mkdir(parents=True, exist_ok=True)
     (to / OUTPUT_MARK).touch()
     with output_lock(to):
@@ -309,17 +309,23 @@ def is_doubtful(link: BlockLink) -> bool:
     return link.relative_offset > DOUBTFUL_OFFSET or link.turn_deg > DOUBTFUL_TURN_DEG
 
 
-def camera_doubts(blocks: Sequence[Block], alignment: BlockAlignment) -> dict[str, str]:
-    """Return the common cameras that two blocks place differently, with the reason."""
-    doubts: dict[str, str] = {}
+def evidence_of_blocks(blocks: Sequence[Block], alignment: BlockAlignment) -> dict[str, tuple[float, str]]:
+    """Return the common cameras that two blocks place differently, with a likelihood ratio and what it rests on.
+
+    At most one of two different poses is right: if that of one block is, the other one is wrong, which is as probable
+    as that block found.
+    """
+    found: dict[str, tuple[float, str]] = {}
     for link in alignment.links:
+        known = [probability_of(blocks[number].poses) for number in (link.first, link.second)]
         for name, offset in zip(link.names, link.offsets.tolist(), strict=True):
             if offset > 0.5 * link.spacing:  # the distance between neighbouring cameras
-                doubts[name] = (
+                found[name] = (
+                    1 - min(probabilities[name] for probabilities in known),
                     f"{blocks[link.first].name} and {blocks[link.second].name} place it "
-                    f"{offset / link.spacing:.2g} times the distance between neighbouring cameras apart"
+                    f"{offset / link.spacing:.2g} times the distance between neighbouring cameras apart",
                 )
-    return doubts
+    return found
 
 
 def scale_notes(blocks: Sequence[Block], alignment: BlockAlignment) -> list[str]:

@@ -160,12 +160,13 @@ class PlacedModel:
         agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
         return {_edge(image, partner): rank for partner, rank in explained_partners(evidence, agrees).items()}
 
-    def remove(self, image: int) -> None:
-        """Remove an image from the model."""
-        del self.cameras[image]
-        self.chosen = {edge: rank for edge, rank in self.chosen.items() if image not in edge}
-        self._ranges[image][:] = np.nan
-        self._parallax[image][:] = 0
+    def with_cameras(self, cameras: Mapping[int, Rigid3]) -> PlacedModel:
+        """Return a model of the same pairs with other cameras, whose geometries and ranges depend on these alone."""
+        model = PlacedModel(self.pairs, dict(cameras))
+        model.choose_again()
+        model.learn_ranges()
+        model.choose_again()
+        return model
 
     def held_by(self, images: Collection[int]) -> list[int]:
         """Return the images that only pairs with some of the images connect to the largest part of the others."""

@@ -87,7 +87,18 @@ class Confirmation:
     def __init__(self, load: Callable[[int], Picture]) -> None:
         self._load = load
         self._small: dict[int, _Small] = {}
-        self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], float, RangeMap]]] = OrderedDict()
+        self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], RangeMap]]] = OrderedDict()
+        self._evidence_of: dict[tuple[tuple[int, ...], ...], list[tuple[list[Rigid3], Evidence]]] = {}
+
+    def shares(self, cameras: Mapping[int, Rigid3]) -> dict[int, float]:
+        """Return the share of every camera of a model, with one sweep for each; see `evidence`.
+
+        What two models have in common is computed once.
+        """
+        return {
+            image: self.evidence(image, pose, cameras, independent=False).share
+            for image, pose in sorted(cameras.items())
+        }
 
     def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
         """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
@@ -111,20 +122,38 @@ class Confirmation:
     def _evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3], *, independent: bool) -> Evidence:
         others = {idx: camera for idx, camera in cameras.items() if idx != image}
         sources = nearest_cameras(pose, others)
+        if not sources:
+            return Evidence(np.zeros(_CLASSES), np.zeros(_CLASSES))
+        seen_by = []
+        for source in sources:
+            around = {idx: camera for idx, camera in others.items() if idx != source}
+            # With two images, each can only be checked against the other.
+            seen_by.append(
+                nearest_cameras(others[source], around if independent else {**around, image: pose}) or [image]
+            )
+        compared = (image, *sources), *map(tuple, seen_by)
+        everybody = {**others, image: pose}
+        relative = [everybody[idx] @ pose.inverse() for idx in dict.fromkeys(idx for one in compared for idx in one)]
+        known = self._evidence_of.setdefault(compared, [])
+        for before, evidence in known:
+            if _nearly_equal(relative, before):
+                return evidence
+        evidence = self._compared(image, sources, seen_by, cameras=everybody)
+        known.append((relative, evidence))
+        del known[:-3]
+        return evidence
+
+    def _compared(
+        self, image: int, sources: Sequence[int], seen_by: Sequence[Sequence[int]], *, cameras: Mapping[int, Rigid3]
+    ) -> Evidence:
+        """Return how much of what an image sees its sources confirm, whose maps are swept against other images."""
+        pose = cameras[image]
         small = self.small(image)
         solid_angle = np.broadcast_to(pixel_solid_angle(small.mask.shape)[:, None], small.mask.shape)
         textured = small.textured & small.mask
-        if not sources:
-            return Evidence(np.zeros(_CLASSES), np.zeros(_CLASSES))
-        own = self._swept(image, pose, sources, cameras=others)
-        maps, poses = [], []
-        for source in sources:
-            around = {idx: camera for idx, camera in others.items() if idx != source}
-            everybody = {**around, image: pose}
-            # With two images, each can only be checked against the other.
-            seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
-            maps.append(self._swept(source, others[source], seen_by, cameras=everybody))
-            poses.append(others[source])
+        own = self._swept(image, sources, cameras=cameras)
+        maps = [self._swept(source, seeing, cameras=cameras) for source, seeing in zip(sources, seen_by, strict=True)]
+        poses = [cameras[source] for source in sources]
         confirmed = textured & _confirmed(own, pose, maps, source_poses=poses)
         classes = _parallax_classes(own.range, pose, poses)
         return Evidence(
@@ -142,27 +171,23 @@ class Confirmation:
             self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
         return self._small[image]
 
-    def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
+    def _swept(self, image: int, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
 
         A map with nearly the same relative poses is reused: an adjustment moves all cameras slightly.
         """
-        relative = [cameras[idx] @ pose.inverse() for idx in sources]
-        scale = float(np.median([np.linalg.norm(to.translation) for to in relative]))
+        relative = [cameras[idx] @ cameras[image].inverse() for idx in sources]
         known = self._maps.setdefault((image, *sources), [])
         self._maps.move_to_end((image, *sources))
-        for before, before_scale, ranges in known:
-            # Nearly the same for a sweep at 256 columns.
-            if all(
-                np.linalg.norm(a.translation / scale - b.translation / before_scale) < 0.005
-                and geodesic_angle(a.rotation, b.rotation) < np.deg2rad(0.1)
-                for a, b in zip(relative, before, strict=True)
-            ):
-                return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
+        for before, ranges in known:
+            if _nearly_equal(relative, before):
+                scale = np.float32(_usual_distance(relative) / _usual_distance(before))
+                return RangeMap(ranges.range * scale, ranges.confidence)
         ranges = self._sweep(image, sources, relative)
-        known.append((relative, scale, ranges))
+        known.append((relative, ranges))
         del known[:-3]
-        if len(self._maps) > 400:
+        # Each camera needs its own map and those of its neighbours, in every pass over all cameras.
+        if len(self._maps) > max(400, 2 * len(self._small)):
             self._maps.popitem(last=False)
         return ranges
 
@@ -181,6 +206,20 @@ class Confirmation:
             reference_mask=small.mask,
             source_masks=[self.small(idx).mask for idx in sources],
         )
+
+
+def _nearly_equal(relative: Sequence[Rigid3], before: Sequence[Rigid3]) -> bool:
+    """Return whether relative poses differ by nothing but scale and what a sweep at 256 columns hardly notices."""
+    scale, before_scale = _usual_distance(relative), _usual_distance(before)
+    return all(
+        np.linalg.norm(a.translation / scale - b.translation / before_scale) < 0.005
+        and geodesic_angle(a.rotation, b.rotation) < np.deg2rad(0.1)
+        for a, b in zip(relative, before, strict=True)
+    )
+
+
+def _usual_distance(relative: Sequence[Rigid3]) -> float:
+    return float(np.median([np.linalg.norm(to.translation) for to in relative]))
 
 
 def _confirmed(

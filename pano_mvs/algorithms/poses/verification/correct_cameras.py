@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,12 +10,14 @@ import numpy as np
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.resection import points_needed
 from pano_mvs.algorithms.poses.verification.aliases import other_arrangement
+from pano_mvs.algorithms.poses.verification.arrangements import is_more_confirmed
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful, is_left_out, reason
-from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence
+from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence, is_same_place
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
-from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
 from pano_mvs.geometry import Rigid3
+
+_MAX_PLACES = 4  # number of places of an image that are compared, as many as a camera has neighbours in a small sweep
 
 
 @dataclass(eq=False)
@@ -32,46 +34,95 @@ class CameraChecks:
     doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
     removed: dict[int, str] = field(default_factory=dict)  # images that were removed from the model, with the reason
     links_contradicting: float = np.nan  # largest share of the weight of learned pairs that contradicted the cameras
+    refuted: dict[int, list[Rigid3]] = field(default_factory=dict)  # image position to poses that the images refute
+    # doubtful images with another place that the images do not refute, or that was not compared; None: not compared
+    undecided: set[int] | None = None
+    compared: int = 0  # number of other poses that were compared
     asked: bool = True  # whether the images were consulted
 
 
 def correct_cameras(
     model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), miss_cost: float = MISS_COST
-) -> CameraChecks:
-    """Check all cameras of a model by the images, and correct those for which another pose is more probable.
+) -> tuple[PlacedModel, CameraChecks]:
+    """Check all cameras of a model by the images, and correct those for which the images prefer another pose.
 
-    Doubtful cameras are tried at the other poses that their pairs suggest, against cameras that are not doubtful. The
-    model is changed in place.
+    Doubtful cameras are tried at the other poses that their pairs suggest, and move only if all cameras together are
+    confirmed more (see `is_more_confirmed`). A camera that is surely wrong is left out unless others lose by it.
 
     Args:
         model: a model with two or more cameras.
         confirmation: of the same capture.
         fixed: images that are never moved or removed, only reported as doubtful.
         miss_cost: see `is_doubtful`.
+
+    Returns:
+        The model, another one if cameras were moved or removed, and its checks.
     """
     found = CameraChecks()
     _judge(model, confirmation, found)
     _believe(model, found, miss_cost=miss_cost)
-    suspects = sorted(
-        (image for image, p in found.p_right.items() if image not in fixed and is_doubtful(p, miss_cost=miss_cost)),
-        key=lambda image: (found.p_right[image], image),
-    )
-    trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
-    if len(trusted) < 2:
-        trusted = dict(model.cameras)
-    for image in suspects:
-        if pose := _more_probable_place(model, image, trusted, confirmation=confirmation, found=found):
-            model.add(image, pose)
-            trusted[image] = pose
-            found.moved.add(image)
-    if found.moved:
-        found.links_contradicting = np.nan
+    budget = 2 * len(model.cameras)
+    while suspects := _suspects(found, fixed=fixed, miss_cost=miss_cost):
+        before = model
+        undecided = found.undecided = {*suspects}
+        for image in suspects:
+            if found.compared < budget:
+                undecided.discard(image)
+                model = _at_best_place(model, image, confirmation, found, undecided)
+        if model is not before:
+            found.links_contradicting = np.nan
+            found.refuted.clear()
+            found.undecided = None
+            _judge(model, confirmation, found)
+        _believe(model, found, miss_cost=miss_cost)
+        if model is before:
+            break
+    while (left := _without_worst(model, confirmation, found, fixed=fixed, miss_cost=miss_cost)) is not None:
+        model = left
         _judge(model, confirmation, found)
         _believe(model, found, miss_cost=miss_cost)
-    while _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
-        _judge(model, confirmation, found)
-        _believe(model, found, miss_cost=miss_cost)
-    return found
+    return model, found
+
+
+def _suspects(found: CameraChecks, *, fixed: Collection[int], miss_cost: float) -> list[int]:
+    """Return the doubtful images that may be moved, the least probable first."""
+    doubtful = [image for image, p in found.p_right.items() if is_doubtful(p, miss_cost=miss_cost)]
+    return sorted({*doubtful} - {*fixed}, key=lambda image: (found.p_right[image], image))
+
+
+def _at_best_place(
+    model: PlacedModel, image: int, confirmation: Confirmation, found: CameraChecks, undecided: set[int]
+) -> PlacedModel:
+    """Return the model with an image where all cameras together are confirmed most, of the places its pairs suggest.
+
+    The images refute other places if they confirm less of all cameras there. It moves to no place that points refuse.
+    """
+    others = {idx: camera for idx, camera in model.cameras.items() if idx != image}
+    if len(others) < 2:
+        return model
+    without = model.with_cameras(others)
+    evidence, places = without.place(image)
+    shares = confirmation.shares(model.cameras)
+    best = model.cameras
+    refuted = []
+    for place in places[:_MAX_PLACES]:
+        pose, support, known = without.polished(image, evidence, place)
+        if is_same_place(pose, model.cameras, image):
+            continue
+        found.compared += 1
+        moved = {**others, image: pose}
+        after = confirmation.shares(moved)
+        if is_more_confirmed(shares, after):
+            refuted.append(place.cam_from_world)
+        elif support >= points_needed(known) and is_more_confirmed(after, shares):
+            best, shares = moved, after
+        else:
+            undecided.add(image)
+    found.refuted[image] = refuted
+    if best is model.cameras:
+        return model
+    found.moved.add(image)
+    return model.with_cameras(best)
 
 
 def check_cameras(model: PlacedModel) -> CameraChecks:
@@ -110,45 +161,15 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
     found.expected = {image: expected_of(image) for image in evidence}
 
 
-def _more_probable_place(
-    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], *, confirmation: Confirmation, found: CameraChecks
-) -> Rigid3 | None:
-    """Return the pose of an image at which it is most probably right; None for its own, or if there is no other."""
-    cameras = {idx: camera for idx, camera in trusted.items() if idx != image}
-    if len(cameras) < 2:
-        return None
-
-    def probability(pose: Rigid3) -> float:
-        moved = model.copy()
-        moved.add(image, pose)
-        shares = {**found.shares, image: confirmation.share(image, pose, cameras)}
-        return FITTED.probability(camera_evidence(moved, shares, found.expected, images=[image])[image])
-
-    poses = [model.cameras[image], *_alternatives(model, image, cameras)]
-    best = max(poses, key=probability)
-    return None if best is poses[0] else best
-
-
-def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3]) -> list[Rigid3]:
-    """Return the poses that an image's pairs with some cameras suggest, refined on known points."""
-    without = model.copy()
-    without.cameras = dict(cameras)
-    pair_evidence, places = without.place(image)
-    poses = []
-    for place in places[:4]:
-        # Minimum share of the best placement's score by matches, for a pose to be tried at all.
-        if place.score < 0.2 * places[0].score:
-            continue
-        pose, support, known = without.polished(image, pair_evidence, place)
-        if support >= points_needed(known):
-            poses.append(pose)
-    return poses
-
-
 def _believe(model: PlacedModel, found: CameraChecks, *, miss_cost: float = MISS_COST) -> None:
     """Find the probability that each camera is right, and the doubts that follow from it."""
     rows = found.evidence = camera_evidence(
-        model, found.shares, found.expected, contradicting_before=found.links_contradicting
+        model,
+        found.shares,
+        found.expected,
+        contradicting_before=found.links_contradicting,
+        refuted=found.refuted,
+        undecided=found.undecided,
     )
     contradicting = [row["links_contradicting"] for row in rows.values() if np.isfinite(row["links_contradicting"])]
     found.links_contradicting = max(contradicting, default=found.links_contradicting)
@@ -156,35 +177,31 @@ def _believe(model: PlacedModel, found: CameraChecks, *, miss_cost: float = MISS
     doubtful = [image for image in rows if is_doubtful(found.p_right[image], miss_cost=miss_cost)]
     ambiguity = other_arrangement(model) if doubtful else ""
     found.doubts = {image: reason(FITTED, rows[image], ambiguity=ambiguity) for image in doubtful}
-    _doubt_contradicted_parts(model, found)
 
 
-def _doubt_contradicted_parts(model: PlacedModel, found: CameraChecks) -> None:
-    """Report parts that verified pairs contradict as doubtful, unless the images confirm most of their texture."""
-    for part in contradicted_parts(model, found.shares):
-        one, other = (model.pairs.names[image] for image in part.pair)
-        why = (
-            f"{100 * part.share:.0f} % of the evidence of pairs between its part of the capture and the rest "
-            f"contradicts their places, most of all that of {one} and {other}: take panoramas in between"
-        )
-        for image in part.images:
-            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), why)))
+def _without_worst(
+    model: PlacedModel,
+    confirmation: Confirmation,
+    found: CameraChecks,
+    *,
+    fixed: Collection[int],
+    miss_cost: float,
+) -> PlacedModel | None:
+    """Return the model without the camera that is wrong most surely, and without those that only it holds.
 
-
-def _leave_out_worst(model: PlacedModel, found: CameraChecks, *, fixed: Collection[int], miss_cost: float) -> bool:
-    """Remove the camera that is wrong most surely, if that is sure enough, and those that only it holds.
-
-    The others may have been doubted because of it, so they are to be judged again. At least two are kept.
+    It is None if no camera is wrong surely enough, if others would be confirmed less without it, or if fewer than three
+    are left. The others may have been doubted because of it, so they are to be judged again.
     """
     worst = min(found.p_right.keys() - fixed, key=lambda image: (found.p_right[image], image), default=None)
     if worst is None or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
-        return False
-    held = model.held_by([worst])
-    if len(model.cameras) - len(held) <= 2:
-        return False
-    found.removed |= {worst: found.doubts[worst]} | dict.fromkeys(
-        held, "its pairs are all with images that were left out"
-    )
-    for image in (worst, *held):
-        model.remove(image)
-    return True
+        return None
+    gone = {worst, *model.held_by([worst])}
+    cameras = {image: camera for image, camera in model.cameras.items() if image not in gone}
+    if len(cameras) <= 2:
+        return None
+    shares, before = confirmation.shares(cameras), confirmation.shares(model.cameras)
+    if is_more_confirmed({image: share for image, share in before.items() if image not in gone}, shares):
+        return None
+    held = dict.fromkeys(sorted(gone - {worst}), "its pairs are all with images that were left out")
+    found.removed |= {worst: found.doubts[worst]} | held
+    return model.with_cameras(cameras)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
+from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
+from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
+from pano_mvs.algorithms.poses.verification.arrangements import (
+    is_more_confirmed,
+    other_arrangements,
+    settled,
+    shares_of,
+)
+from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras
 from pano_mvs.core.settings import Setting, checks_settings
@@ -53,45 +62,89 @@ def verify_poses(
     """
     if len(poses.names) < 2:
         return poses
-    groups = [
-        verified_group(
-            group, load, features=features or {}, two_views=two_views or {}, correct=correct, miss_cost=miss_cost
-        )
-        for group in split_groups(poses)
-    ]
+    known = features is not None and all(name in features for name in poses.names)
+    capture = _Capture(load, features if known and features else {}, two_views or {}, names=poses.names)
+    verified = _verified(poses, capture, correct=correct, miss_cost=miss_cost)
+    if correct and capture.pairs.compared and not poses.metric and _is_doubtful(verified, miss_cost=miss_cost):
+        other = _more_confirmed(verified, capture)
+        if other is not None:
+            verified = _verified(other, capture, correct=True, miss_cost=miss_cost)
+    return verified
+
+
+class _Capture:
+    """The images of a capture, their pairs, and small sweeps of them."""
+
+    def __init__(
+        self,
+        load: Callable[[str], Picture],
+        features: Mapping[str, Features],
+        two_views: Mapping[tuple[str, str], TwoView],
+        *,
+        names: Sequence[str],
+    ) -> None:
+        self.features, self.two_views = features, two_views if features else {}
+        self.names = tuple(features) or tuple(names)
+        self.position = {name: idx for idx, name in enumerate(self.names)}
+        self.confirmation = Confirmation(lambda image: load(self.names[image]))
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """All pairs."""
+        return self.pairs_among(self.names)
+
+    def pairs_among(self, names: Collection[str]) -> Pairs:
+        """Return the pairs among some images."""
+        inside = {pair: view for pair, view in self.two_views.items() if {*pair} <= {*names}}
+        return pairs_of(self.features, inside) if self.features else Pairs.without(self.names)
+
+
+def _verified(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
+    """Return poses whose groups are checked and corrected."""
+    groups = [_verified_group(group, capture, correct=correct, miss_cost=miss_cost) for group in split_groups(poses)]
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
 
 
-def verified_group(
-    poses: Poses,
-    load: Callable[[str], Picture],
-    *,
-    features: Mapping[str, Features],
-    two_views: Mapping[tuple[str, str], TwoView],
-    correct: bool,
-    miss_cost: float = MISS_COST,
-) -> Poses:
-    """Check and correct poses of one group; the arguments are those of `verify_poses`."""
-    known = all(name in features for name in poses.names)
-    inside = {pair: view for pair, view in two_views.items() if known and {*pair} <= {*poses.names}}
-    pairs = pairs_of({name: features[name] for name in poses.names}, inside) if known else Pairs.without(poses.names)
-    model = model_of(poses, pairs)
-    confirmation = Confirmation(lambda image: load(poses.names[image]))
-    fixed = () if correct and inside else range(len(poses.names))
-    checks = correct_cameras(model, confirmation, fixed=fixed, miss_cost=miss_cost)
+def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
+    """Return poses of one group that are checked and corrected."""
+    pairs = capture.pairs_among(poses.names)
+    model = PlacedModel(pairs).with_cameras(
+        {capture.position[name]: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+    )
+    fixed = () if correct and pairs.compared else [*model.cameras]
+    model, checks = correct_cameras(model, capture.confirmation, fixed=fixed, miss_cost=miss_cost)
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     return with_camera_checks(poses, pairs, checks)
 
 
-def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
-    """Return a model with the given cameras, whose names are those of the pairs, and the geometries that agree."""
-    model = PlacedModel(pairs, {idx: poses.cam_from_world(idx) for idx in range(len(poses.names))})
-    model.choose_again()
-    model.learn_ranges()
-    model.choose_again()
-    return model
+def _is_doubtful(poses: Poses, *, miss_cost: float) -> bool:
+    """Return whether an arrangement as a whole is doubtful: whether an average camera of it is."""
+    known = poses.right_probabilities
+    return known is not None and is_doubtful(float(np.nanmean(known)), miss_cost=miss_cost)
+
+
+def _more_confirmed(poses: Poses, capture: _Capture) -> Poses | None:
+    """Return the arrangement of a capture that the images confirm most of those with few pairs; None for its own."""
+    best = None
+    shares = shares_of(
+        [{capture.position[name]: pose for name, pose in group.cameras.items()} for group in split_groups(poses)],
+        capture.confirmation,
+    )
+    for models in other_arrangements(capture.features, capture.two_views, capture.pairs):
+        found = shares_of([model.cameras for model in models], capture.confirmation)
+        if is_more_confirmed(found, shares):
+            best, shares = models, found
+    if best is None:
+        return None
+    if len(best) > 1:
+        joined = [settled(model, capture.pairs) if len(parts) > 1 else model for model, parts in join_models(best)]
+        if is_more_confirmed(shares_of([model.cameras for model in joined], capture.confirmation), shares):
+            best = joined
+    groups = [normalised_poses(poses_of(model)) for model in best]
+    missing = dict.fromkeys(capture.names, "the arrangement that the images confirm most has no place for it")
+    return join_groups(groups, order=capture.names, rejected=missing | {**poses.rejected})
 
 
 def poses_of(model: PlacedModel) -> Poses:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from pano_mvs.algorithms.logistic import Model
+from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.core.text import plural
+from pano_mvs.scene import Poses
 
 MISS_COST = 5.0
 """Cost of a wrong camera that is not doubted, relative to that of a right one that is."""
@@ -85,6 +88,40 @@ def is_doubtful(probability: float, *, miss_cost: float = MISS_COST) -> bool:
 def is_left_out(probability: float, *, miss_cost: float = MISS_COST) -> bool:
     """Return whether a doubtful camera is left out: as surely wrong as one without a doubt is right."""
     return is_doubtful(probability, miss_cost=miss_cost) and not is_doubtful(1 - probability, miss_cost=miss_cost)
+
+
+def probability_of(poses: Poses) -> dict[str, float]:
+    """Return the probability that each camera is right; without one, that of a camera of which nothing was measured."""
+    known = poses.right_probabilities
+    values = np.full(len(poses.names), np.nan) if known is None else known
+    return dict(zip(poses.names, np.where(np.isfinite(values), values, FITTED.probability({})).tolist(), strict=True))
+
+
+def with_later_evidence(
+    poses: Poses, evidence: Mapping[str, tuple[float, str]], *, miss_cost: float = MISS_COST
+) -> Poses:
+    """Return poses whose probabilities and doubts take account of what was measured after they were verified.
+
+    Args:
+        poses: of any origin.
+        evidence: image name to the likelihood of what was measured if the pose is right, relative to that if it is
+            wrong, and a sentence that says what it is.
+        miss_cost: see `is_doubtful`.
+    """
+    if not evidence.keys() & {*poses.names}:
+        return poses
+    before = probability_of(poses)
+    known = poses.right_probabilities
+    probabilities = np.full(len(poses.names), np.nan) if known is None else known.copy()
+    doubts = dict(poses.doubts)
+    for idx, name in enumerate(poses.names):
+        if name in evidence:
+            ratio, why = evidence[name]
+            probabilities[idx] = before[name] * ratio / (before[name] * ratio + 1 - before[name])
+            if is_doubtful(probabilities[idx], miss_cost=miss_cost):
+                stated = f"its pose is right with a probability of {_percent(probabilities[idx])}: {why}"
+                doubts[name] = "; ".join(filter(None, (poses.doubts.get(name), stated)))
+    return replace(poses, right_probabilities=probabilities, doubts=doubts)
 
 
 def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> str:

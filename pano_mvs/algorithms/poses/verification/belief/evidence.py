@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
-from pano_mvs.geometry import geodesic_angle
+from pano_mvs.geometry import Rigid3, geodesic_angle
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, float]
@@ -25,6 +25,8 @@ def camera_evidence(
     *,
     images: Collection[int] | None = None,
     contradicting_before: float = np.nan,
+    refuted: Mapping[int, Sequence[Rigid3]] | None = None,
+    undecided: Collection[int] | None = None,
 ) -> dict[int, Row]:
     """Return the evidence for cameras of a model, which is to be measured after all choices were made.
 
@@ -35,6 +37,8 @@ def camera_evidence(
         images: whose evidence to return; None for that of all cameras.
         contradicting_before: the largest `links_contradicting` of the model with cameras that were left out since then:
             what contradicted them speaks against those that agree with them, such as copies of a room, as well.
+        refuted: image position to poses that the images refute; places there are no rivals.
+        undecided: images with another place that the images do not refute; None if they were not asked.
 
     Returns:
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
@@ -45,13 +49,14 @@ def camera_evidence(
         larger part of those with such pairs; see `weight_of_pair`), and `links_contradicting` (share of the weight of
         all learned pairs of the model that does not agree with its cameras), for cameras with such.
     """
-    repeats = _repeats(model)
+    refuted = refuted or {}
+    repeats = _repeats(model, model.cameras if undecided is None else undecided)
     linked, links_contradicting = _links(model)
     links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
     for image in sorted(model.cameras if images is None else images):
         share = shares.get(image, np.nan)
-        of_pairs = _of_pairs(model, image)
+        of_pairs = _of_pairs(model, image, refuted.get(image, ()))
         # If no pair agrees, and those that do not may be chance, the pairs say nothing.
         known = of_pairs["agreeing"] > 0 or _has_certain_pair(model, image)
         rows[image] = {
@@ -72,11 +77,16 @@ def _has_certain_pair(model: PlacedModel, image: int) -> bool:
     )
 
 
-def _repeats(model: PlacedModel) -> float:
+def _repeats(model: PlacedModel, undecided: Collection[int]) -> float:
+    """Return the mean weight of other geometries of pairs, relative to those in use.
+
+    Other geometries would put one of the two images elsewhere. They do not count if this is decided for both.
+    """
     of_cameras: dict[int, list[tuple[float, int]]] = {}
     for edge, rank in model.chosen.items():
         found = model.pairs.geometries[edge]
-        rival = max((other.weight for number, other in enumerate(found) if number != rank), default=0.0)
+        rivals = (other.weight for number, other in enumerate(found) if number != rank)
+        rival = max(rivals, default=0.0) if {*edge} & {*undecided} else 0.0
         for image in edge:
             of_cameras.setdefault(image, []).append((rival / max(found[rank].weight, 1e-9), len(found[rank].view)))
     means = [
@@ -86,7 +96,7 @@ def _repeats(model: PlacedModel) -> float:
     return float(np.mean(means)) if means else np.nan
 
 
-def _of_pairs(model: PlacedModel, image: int) -> Row:
+def _of_pairs(model: PlacedModel, image: int, refuted: Sequence[Rigid3]) -> Row:
     """Return how well the pairs of a camera agree with it, and with another place."""
     edges = [edge for edge in model.chosen if image in edge]
     errors = _scale_errors(model, image, edges)
@@ -94,7 +104,7 @@ def _of_pairs(model: PlacedModel, image: int) -> Row:
     return {
         "agreeing": float(len(edges)),
         "scale_worst": float(errors.max()) if len(errors) else np.nan,
-        "place_rival": _place_rival(model, image, own),
+        "place_rival": _place_rival(model, image, own, refuted),
     }
 
 
@@ -106,21 +116,31 @@ def _scale_errors(model: PlacedModel, image: int, edges: Sequence[Edge]) -> Floa
     return np.asarray(np.abs(np.log(evidence.lengths[known] / actual[known])))
 
 
-def _place_rival(model: PlacedModel, image: int, own: float) -> float:
-    """Return the weight of the best other place that the pairs of a camera suggest, relative to its own."""
+def _place_rival(model: PlacedModel, image: int, own: float, refuted: Sequence[Rigid3]) -> float:
+    """Return the weight of the best other place that the pairs of a camera suggest, relative to its own.
+
+    Places that the images refute are not counted.
+    """
     places = model.place(image)[1] if len(model.cameras) > 2 else []
     if not places or own <= 0:
         return np.nan
-    here = model.cameras[image]
-    nearest = min(float(np.linalg.norm(pose.center - here.center)) for i, pose in model.cameras.items() if i != image)
-    # A place counts as another one beyond this share of the distance to the nearest camera, or this rotation.
+    known = (model.cameras[image], *refuted)
     elsewhere = (
         place.score
         for place in places
-        if float(np.linalg.norm(place.cam_from_world.center - here.center)) > 0.1 * nearest
-        or float(geodesic_angle(place.cam_from_world.rotation, here.rotation)) > 0.07
+        if not any(is_same_place(place.cam_from_world, {**model.cameras, image: pose}, image) for pose in known)
     )
     return next(elsewhere, 0.0) / own
+
+
+def is_same_place(pose: Rigid3, cameras: Mapping[int, Rigid3], image: int) -> bool:
+    """Return whether a pose is that of a camera, within a share of the distance to the nearest other camera."""
+    here = cameras[image]
+    nearest = min(float(np.linalg.norm(other.center - here.center)) for idx, other in cameras.items() if idx != image)
+    return (
+        float(np.linalg.norm(pose.center - here.center)) <= 0.1 * nearest
+        and float(geodesic_angle(pose.rotation, here.rotation)) <= 0.07
+    )
 
 
 def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
