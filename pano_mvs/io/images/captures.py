@@ -290,13 +290,13 @@ def _pairs(
         if not files:
             yield RigPictures(shared, (), f"does not belong to a lens: no {layout} {' or '.join(lens_names)}")
             continue
-        for name, group in _by_format(shared, files):
+        for stem, group in _by_format(shared, files):
             missing = [lens for idx, lens in enumerate(lens_names) if idx not in group]
             problem = f"the picture of the lens {missing[0]} is missing" if missing else ""
             used = tuple(group[idx][0] for idx in sorted(group))
             if len({file.suffix for file in used}) > 1:
                 problem = "the pictures of its lenses have different formats; save both in the same"
-            yield RigPictures(f"{name}.png", used, problem)
+            yield RigPictures(f"{stem}.png", used, problem)
             for first, *others in group.values():
                 for other in others:
                     why = f"shows the same capture and lens as {name_of[first]}; rename or remove one of them"
