@@ -368,6 +368,18 @@ class Resolver:
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
 
 
+def single_unit(entry: StageEntry, inputs: Mapping[str, ItemRef | None], store: Store) -> Unit:
+    """Return the unit of a stage outside a workflow; all ports of the stage are One ports.
+
+    Args:
+        inputs: port to the stored value; None for optional ports without one.
+    """
+    static = _static_identity(entry, store)
+    encoded = {port: None if ref is None else ref.digest for port, ref in inputs.items()}
+    key = digest_from_value([digest_from_value(static), encoded])
+    return Unit(entry, WHOLE, (), inputs, key, static | {"inputs": encoded})
+
+
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
     """Return the part of the identity that all units of a stage share."""
     plain, paths = key_fields(entry.params)
