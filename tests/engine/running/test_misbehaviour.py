@@ -9,6 +9,7 @@ import threading
 
 import pytest
 
+from pano_mvs.core.errors import PluginError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.session.running import Execution, run_session
@@ -152,3 +153,45 @@ def test_the_others_go_on_and_the_cache_stays_readable(misbehaved: Misbehaved) -
     assert len(toy.plan()["scaled"].cached) == 5 + len(HARMLESS)
     assert store.damaged == []
     assert not list((toy.folder / "cache" / "tmp").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("raise ValueError('odd')", r"plug\.py:\d+: ValueError: odd"),
+        ("raise SystemExit(0)", r"plug\.py:\d+: SystemExit: 0"),
+        ("return float('nan')", "ValueError: cannot convert float NaN to integer"),
+        ("return float('inf')", "OverflowError: cannot convert float infinity to integer"),
+        ("return 'much'", "ValueError: invalid literal"),
+    ],
+)
+def test_a_function_for_the_memory_that_fails_costs_its_units(toy: Toy, code: str, reason: str) -> None:
+    """It is called in the main process: the command ended with a traceback, or with exit code 0."""
+    marked = '@stage("toy.mean")'
+    function = f"def needed(params, inputs):\n    {code}\n\n"
+    toy.edit("plug.py", lambda text: text.replace(marked, f'{function}@stage("toy.mean", memory=needed)'))
+    result = toy.run()
+    causes = [failure.cause for failure in result.failures]
+    assert [bool(re.search(reason, cause)) for cause in causes] == [True] * 5
+    assert result.exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (
+            "raise ValueError('odd')",
+            r"images: source toy\.source cannot list its items: .*plug\.py:\d+: ValueError: odd",
+        ),
+        ("raise SystemExit(0)", r"plug\.py:\d+: SystemExit: 0"),
+        ("return None", "TypeError: 'NoneType' object is not iterable"),
+        ("return ['1.txt']", "TypeError: an item is a str, not a SourceItem"),
+    ],
+)
+def test_a_source_that_cannot_list_its_items_is_the_plugins_error(toy: Toy, code: str, reason: str) -> None:
+    """The command called it a bug of its own."""
+    begin = "def list_items(params):\n"
+    rest = '    for path in sorted(params.path.glob("*.txt")):\n        yield SourceItem(path.name, {"text": path})\n'
+    toy.edit("plug.py", lambda text: text.replace(begin + rest, f"{begin}    {code}\n"))
+    with pytest.raises(PluginError, match=reason):
+        toy.run()
