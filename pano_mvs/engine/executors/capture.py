@@ -24,7 +24,8 @@ def captured(log: Path) -> Iterator[None]:
     """
     make_folder(log.parent)
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
-    kept_streams = sys.stdout, sys.stderr
+    # The original streams are hidden as well, because code that closes one of them would silence this process.
+    kept_streams = sys.stdout, sys.stderr, sys.__stdout__, sys.__stderr__
     kept = [os.dup(_STDOUT), os.dup(_STDERR)]
     stream = io.TextIOWrapper(
         os.fdopen(os.dup(target), "wb", 0), "utf-8", errors="backslashreplace", write_through=True
@@ -33,11 +34,11 @@ def captured(log: Path) -> Iterator[None]:
         _flush()
         os.dup2(target, _STDOUT)
         os.dup2(target, _STDERR)
-        sys.stdout = sys.stderr = stream
+        sys.stdout = sys.stderr = sys.__stdout__ = sys.__stderr__ = stream  # type: ignore[misc]
         with _logging_to(stream):
             yield
     finally:
-        sys.stdout, sys.stderr = kept_streams
+        sys.stdout, sys.stderr, sys.__stdout__, sys.__stderr__ = kept_streams  # type: ignore[misc]
         _flush()
         os.dup2(kept[0], _STDOUT)
         os.dup2(kept[1], _STDERR)

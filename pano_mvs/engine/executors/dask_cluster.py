@@ -228,7 +228,9 @@ def run_unit(run: str, text: str, expected: tuple[str, str]) -> str:
 def end_workers(run: str) -> None:
     """End the worker processes of a run at once."""
     for key in [key for key in _workers if key[0] == run]:
-        _workers.pop(key).kill()
+        worker = _workers.pop(key)
+        worker.kill()
+        worker.stop()  # so that its pipes are closed
 
 
 def introduce(store: str, token: str) -> dict[str, Any]:

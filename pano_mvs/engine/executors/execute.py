@@ -5,6 +5,7 @@ All executors end in `unit_outcome`.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import traceback
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -45,6 +47,12 @@ from pano_mvs.scene import Axis
 from pano_mvs.scene.record import changed_text, vanished_text
 from pano_mvs.scene.two_view import pair_from_name
 
+MAX_METRICS = 1000
+"""Most metrics of a unit: the summary and the report list all of them, which takes 7 s for 10,000."""
+
+MAX_CHARACTERS = 10_000
+"""Most characters of a text that a unit reports."""
+
 
 def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """Run a unit and store its result; the record is written last.
@@ -53,7 +61,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 
     Raises:
         ChangedFileError: if an input file is not the one whose digest is in the key.
-        ContractError: if the stage returns something other than what it declared.
+        ContractError: if the stage returns something other than what it declared, or reports what a record cannot hold.
         Exception: any exception of the stage.
     """
     started, compiling_s = time.perf_counter(), kernel_cache.compilation_time.seconds
@@ -77,19 +85,62 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         except ContractError as error:
             error.add_note(f"returned by stage {unit.entry.spec.name} ({unit.entry.spec.origin}) for {unit.label}")
             raise
-    record = UnitRecord(
-        unit.key,
-        unit.identity,
-        output,
-        items,
-        context.metrics,
-        tuple(context.notes),
-        context.rejected,
-        value.doubted(),
-        max(0.0, time.perf_counter() - started - (kernel_cache.compilation_time.seconds - compiling_s)),
-    )
+        try:
+            metrics = _checked_metrics(context.metrics)
+            notes = tuple(_checked_text("a note", note) for note in _checked_kind("ctx.notes", context.notes, list))
+            rejected = _checked_reasons("ctx.rejected", context.rejected)
+            doubts = _checked_reasons("doubted()", value.doubted())
+        except ContractError as error:
+            error.add_note(f"reported by stage {spec.name} ({spec.origin}) for {unit.label}")
+            raise
+    seconds = max(0.0, time.perf_counter() - started - (kernel_cache.compilation_time.seconds - compiling_s))
+    record = UnitRecord(unit.key, unit.identity, output, items, metrics, notes, rejected, doubts, seconds)
     store.put(record)
     return record
+
+
+def _checked_metrics(found: object) -> dict[str, float]:
+    """Return the metrics of a unit, or raise ContractError if a record cannot hold them."""
+    metrics = _checked_kind("ctx.metrics", found, dict)
+    if len(metrics) > MAX_METRICS:
+        raise ContractError(f"ctx.metrics has {len(metrics):,} entries; a unit may report at most {MAX_METRICS:,}")
+    for name, value in metrics.items():
+        _checked_text("the name of a metric", name)
+        if not isinstance(value, Real):
+            raise ContractError(f"ctx.metrics[{name!r}] is {_kind_of(value)}, not a number")
+        if not math.isfinite(value):
+            raise ContractError(f"ctx.metrics[{name!r}] is {value}: ctx.metric(name, value) leaves such values out")
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def _checked_reasons(name: str, found: object) -> dict[str, str]:
+    """Return reasons by image, or raise ContractError if a record cannot hold them."""
+    reasons = _checked_kind(name, found, Mapping)
+    return {
+        _checked_text(f"an image in {name}", image): _checked_text(f"a reason in {name}", reason)
+        for image, reason in reasons.items()
+    }
+
+
+def _checked_text(name: str, text: object) -> str:
+    if not isinstance(text, str):
+        raise ContractError(f"{name} is {_kind_of(text)}, not a text")
+    if len(text) > MAX_CHARACTERS:
+        raise ContractError(
+            f"{name} has {len(text):,} characters, but at most {MAX_CHARACTERS:,} are possible; ctx.note(text) and "
+            "ctx.reject(image, reason) shorten texts"
+        )
+    return text
+
+
+def _checked_kind(name: str, found: Any, kind: type[Any]) -> Any:
+    if not isinstance(found, kind):
+        raise ContractError(f"{name} is {_kind_of(found)}, not a {kind.__name__.lower()}")
+    return found
+
+
+def _kind_of(value: object) -> str:
+    return "None" if value is None else f"a value of type {type(value).__name__}"
 
 
 def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
@@ -220,7 +271,7 @@ def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
     """
     notes = shortened("".join(f" ({note})" for note in getattr(error, "__notes__", [])))
     if isinstance(error, PanoMvsError):
-        return f"{shortened(str(error))}{notes}", ""
+        return f"{_text(error)}{notes}", ""
     frames = traceback.extract_tb(error.__traceback__)
     # For a plugin, name the line in the plugin; otherwise the line that raised the error.
     own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
@@ -250,17 +301,25 @@ def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOut
         with captured(log):
             bound_threads(threads)
             record = execute_unit(unit, store, threads=threads)
-    except KeyboardInterrupt:
-        raise
     except BaseException as error:  # a unit has also failed if its stage exits, or raises other than Exception
-        return replace(_failed(unit, store, error), seconds=time.perf_counter() - started)
+        if type(error) is KeyboardInterrupt:
+            raise
+        return replace(failed_outcome(unit, store, error), seconds=time.perf_counter() - started)
     return JobOutcome("done", record, seconds=record.seconds)
+
+
+def failed_outcome(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
+    """Return how a unit ended that raised an error, even if the error cannot be described."""
+    try:
+        return _failed(unit, store, error)
+    except Exception as second:  # a plugin's error may hold anything, and memory may be used up
+        return JobOutcome("failed", cause=f"{type(error).__name__} ({type(second).__name__}: {_text(second)})")
 
 
 def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     if isinstance(error, StoreError | RunStoppedError) and not isinstance(error, DamagedBlobError):
         kind = StoreError if isinstance(error, StoreError) else RunStoppedError
-        return JobOutcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
+        return JobOutcome("stopped", cause=_text(error), error=kind.__name__, exit_code=error.exit_code)
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
         store.stat_cache.forget(error.path)

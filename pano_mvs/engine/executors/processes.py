@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
@@ -60,7 +61,7 @@ class ProcessExecutor(Executor):
                 make_folder(errors.parent)
             except OSError as error:
                 raise self._store.cannot_write(error) from error
-            worker = WorkerProcess(self.cores, errors)
+            worker = WorkerProcess(self.cores, errors, units=self._units_per_process)
             thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
             self._workers.append((thread, worker))
             thread.start()
@@ -88,8 +89,9 @@ class ProcessExecutor(Executor):
     def cancel(self) -> None:
         """End the processes of all jobs; later jobs get new ones."""
         self._out.clear()
-        while not self._jobs.empty():
-            self._jobs.get()
+        with suppress(queue.Empty):  # the threads take jobs meanwhile
+            while True:
+                self._jobs.get_nowait()
         for _, worker in self._workers:
             worker.kill()
 
@@ -100,12 +102,15 @@ class ProcessExecutor(Executor):
             self.cancel()
         for _ in self._workers:
             self._jobs.put(None)
-        for thread, _ in self._workers:
-            thread.join()
+        for thread, worker in self._workers:
+            thread.join(_LISTEN_S)
+            while thread.is_alive():  # its process may have started just when all were ended
+                worker.kill()
+                thread.join(_LISTEN_S)
         self._workers.clear()
 
     def _serve(self, worker: WorkerProcess) -> None:
-        """Pass units to one worker until there are no more, and restart it after `units_per_process` units."""
+        """Pass units to one worker until there are no more."""
         while (taken := self._jobs.get()) is not None and not self._closing:
             job, request = taken
             try:
@@ -117,13 +122,15 @@ class ProcessExecutor(Executor):
                     error="StoreError",
                     exit_code=4,
                 )
+            except Exception as error:  # whatever it is, the run must not wait for this unit for ever
+                worker.kill()
+                trace = "".join(traceback.format_exception(error))
+                outcome = JobOutcome("failed", cause=f"it could not be passed to a worker: {error!r}", trace=trace)
             self._failed_starts = self._failed_starts + 1 if worker.refused else 0
             if self._failed_starts >= 3:  # several workers in a row ended while starting
                 cause = f"workers do not start: {outcome.cause}"
                 outcome = replace(outcome, status="stopped", cause=cause, error="PanoMvsError")
             self._ended.put((job.number, outcome))
-            if worker.served >= self._units_per_process:
-                worker.stop()
         worker.stop()
 
 
@@ -135,13 +142,15 @@ _BOOT = (
 class WorkerProcess:
     """A process that computes one unit at a time; it is started for the first one."""
 
-    def __init__(self, threads: int, errors: Path) -> None:
+    def __init__(self, threads: int, errors: Path, *, units: int = UNITS_PER_PROCESS) -> None:
         """Prepare a worker.
 
         Args:
             threads: the most threads that a unit may use.
             errors: file for what the process prints outside units, such as why it cannot start.
+            units: the most units of one process; the next unit gets another one.
         """
+        self._units = units
         self.threads = threads
         self.errors = errors
         self.served = 0  # number of units that the present process has received
@@ -155,7 +164,7 @@ class WorkerProcess:
 
     def run(self, request: Mapping[str, Any]) -> JobOutcome:
         """Compute a unit and wait for it; if the process dies or takes too long, only this unit fails."""
-        if request["fresh"] and self.served:
+        if self.served >= (1 if request["fresh"] else self._units):
             self.stop()
         process = self._process or self._start()
         self.served += 1
@@ -216,12 +225,16 @@ class WorkerProcess:
     ) -> JobOutcome | None:
         """Return the outcome from the worker, or None if it dies first, even if others hold its output open."""
         while (line := self._next_line(process)) is not None:
-            answer = json.loads(line)
-            self._ready = True
-            if {name: answer.get(name) for name in whose} != whose:
-                continue  # it is ready, or another process answered an earlier request
-            if "outcome" in answer:
-                return JobOutcome.from_json(answer["outcome"])
+            try:
+                answer = json.loads(line)
+                self._ready = True
+                if {name: answer.get(name) for name in whose} != whose:
+                    continue  # it is ready, or another process answered an earlier request
+                if "outcome" in answer:
+                    return JobOutcome.from_json(answer["outcome"])
+            except Exception as error:  # the stage has written into our pipe
+                cause = f"its worker process gave an answer that cannot be read ({type(error).__name__}: {error})"
+                return JobOutcome("failed", cause=cause, died=True)
             self._left_s = timeout_s
         return None
 
@@ -258,10 +271,12 @@ class WorkerProcess:
 def _read_lines(process: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
     """Pass on the lines that a process writes, and None at the end, until nobody holds its output open."""
     assert process.stdout is not None
-    with process.stdout as stream:
-        for line in stream:
-            lines.put(line if line.endswith(b"\n") else None)
-    lines.put(None)
+    try:
+        with process.stdout as stream:
+            for line in stream:
+                lines.put(line if line.endswith(b"\n") else None)
+    finally:  # also if a line does not fit into memory
+        lines.put(None)
 
 
 def _close(process: subprocess.Popen[bytes], mark: str) -> None:

@@ -183,9 +183,10 @@ class QueueExecutor(DaskExecutor):
             threads: threads for a unit; 0 for an equal share of the cores.
 
         Raises:
-            UsageError: if dask-jobqueue is not installed, or the queueing system is not on this host.
+            UsageError: if dask-jobqueue is not installed, the queueing system is not on this host, or jobs could not
+                reach this host.
         """
-        self.name = system
+        self.name, self._store = system, store
         places, self.threads = queue.shape(threads)
         self.capacity = with_waiting(places * queue.jobs)
         self.cores = max(queue.cores, self.threads)
@@ -195,27 +196,41 @@ class QueueExecutor(DaskExecutor):
         self._logs = store.root / "jobs"
         self._keys = store.blobs.temporary.absolute() / f"{temporary_prefix()}keys-{uuid.uuid4().hex}"
         kind = cluster_class(system)
-        options = importlib.import_module("dask").config.get(f"jobqueue.{system}.scheduler-options", {})
+        try:
+            self._connect(store, self._cluster_of(kind, job_settings(system, queue, places=places, logs=self._logs)))
+        except BaseException:
+            remove_whole(self._keys)
+            raise
+
+    def _cluster_of(self, kind: Any, settings: dict[str, Any]) -> Any:
+        """Return a cluster whose scheduler has been started in this process."""
+        distributed = importlib.import_module("distributed")
+        options = importlib.import_module("dask").config.get(f"jobqueue.{self.name}.scheduler-options", {})
         try:
             # Encrypted, with new keys that only this user can read: otherwise anyone who can reach a port of this host
             # could run code as this user.
-            security = importlib.import_module("distributed").Security
             self._keys.mkdir(mode=0o700, parents=True)
-            for name, text in security.temporary().get_tls_config_for_role("worker").items():
+            for name, text in distributed.Security.temporary().get_tls_config_for_role("worker").items():
                 if text:
                     (self._keys / name).touch(mode=0o600)
                     (self._keys / name).write_text(text, encoding="ascii")
-            roles = [f"{role}_{name}" for role in ("client", "scheduler", "worker") for name in ("cert", "key")]
-            files = {f"tls_{name}": str(self._keys / name.partition("_")[2]) for name in roles}
-            cluster = kind(
-                job_cls=patient(kind.job_cls),
-                security=security(require_encryption=True, tls_ca_file=str(self._keys / "ca_file"), **files),
-                scheduler_options={"dashboard_address": None, **options},
-                **job_settings(system, queue, places=places, logs=self._logs),
-            )
         except OSError as error:
-            raise store.cannot_write(error) from error
-        self._connect(store, cluster)
+            raise self._store.cannot_write(error) from error
+        roles = [f"{role}_{name}" for role in ("client", "scheduler", "worker") for name in ("cert", "key")]
+        files = {f"tls_{name}": str(self._keys / name.partition("_")[2]) for name in roles}
+        security = distributed.Security(require_encryption=True, tls_ca_file=str(self._keys / "ca_file"), **files)
+        try:
+            return kind(
+                job_cls=patient(kind.job_cls),
+                security=security,
+                scheduler_options={"dashboard_address": None, **options},
+                **settings,
+            )
+        except (RuntimeError, ValueError, OSError) as error:
+            raise UsageError(
+                f"--executor {self.name}: jobs could not reach this host: {error}. Check `interface` in the file of "
+                "--queue: it must be a network interface of this host that the jobs can reach"
+            ) from error
 
     def submit(self, job: Job) -> None:
         """Submit a unit, and the first job.

@@ -21,7 +21,7 @@ from pano_mvs.core.errors import PanoMvsError, PluginError, StoreError, UsageErr
 from pano_mvs.core.files import make_folder
 from pano_mvs.core.paths import is_inside, reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors.execute import unit_outcome
+from pano_mvs.engine.executors.execute import failed_outcome, unit_outcome
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.stages.params import Params, json_settings
@@ -243,7 +243,10 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
-    outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
+    try:
+        outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
+    except KeyboardInterrupt as error:  # raised by the stage: workers ignore interrupts
+        outcome = failed_outcome(unit, store, error)
     for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))

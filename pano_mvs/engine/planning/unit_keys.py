@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -10,10 +11,10 @@ from sys import intern
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import ChangedFileError, InputError, UsageError
+from pano_mvs.core.errors import ChangedFileError, InputError, PanoMvsError, PluginError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.core.paths import reason_of
-from pano_mvs.core.text import shortened_list
+from pano_mvs.core.text import shortened, shortened_list
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
@@ -51,10 +52,23 @@ class SourceListing:
 
         Raises:
             InputError: if the list cannot be made.
+            PluginError: if the function of a plugin that makes it fails.
         """
         assert entry.spec.list_items is not None
         if entry.name not in self._items:
-            self._items[entry.name] = tuple(entry.spec.list_items(entry.params))
+            try:
+                items = tuple(entry.spec.list_items(entry.params))
+                if other := [item for item in items if not isinstance(item, SourceItem)]:
+                    raise TypeError(f"an item is a {type(other[0]).__name__}, not a SourceItem")
+            except PanoMvsError:
+                raise
+            except (Exception, SystemExit) as error:
+                if entry.spec.is_built_in:
+                    raise
+                frame = traceback.extract_tb(error.__traceback__)[-1]
+                what = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {shortened(str(error))}"
+                raise PluginError(f"{entry.name}: source {entry.spec.name} cannot list its items: {what}") from error
+            self._items[entry.name] = items
         return self._items[entry.name]
 
     def size(self) -> CaptureSize:
@@ -366,6 +380,18 @@ class Resolver:
             return list(value)
         state = self.states[self.edges[port].producer]
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
+
+
+def single_unit(entry: StageEntry, inputs: Mapping[str, ItemRef | None], store: Store) -> Unit:
+    """Return the unit of a stage outside a workflow; all ports of the stage are One ports.
+
+    Args:
+        inputs: port to the stored value; None for optional ports without one.
+    """
+    static = _static_identity(entry, store)
+    encoded = {port: None if ref is None else ref.digest for port, ref in inputs.items()}
+    key = digest_from_value([digest_from_value(static), encoded])
+    return Unit(entry, WHOLE, (), inputs, key, static | {"inputs": encoded})
 
 
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:

@@ -72,7 +72,11 @@ class Dispatcher:
         return len(self._running) < self._executor.capacity
 
     def fits(self, unit: Unit) -> bool:
-        """Return whether the memory that a unit declares is free beside that of the running ones."""
+        """Return whether the memory that a unit declares is free beside that of the running ones.
+
+        Raises:
+            Exception: any exception of the stage's function for its memory.
+        """
         needed = self._memory.of(unit)
         if not needed:
             return True
@@ -216,6 +220,6 @@ def _declared(unit: Unit, store: Store) -> int:
         return stated or spec.memory_bytes
     try:
         inputs = {"item": unit.source} if unit.source is not None else arguments_of(unit, store)
-        return spec.memory_needed(unit.entry.params, inputs)
+        return int(spec.memory_needed(unit.entry.params, inputs))  # a plugin may return anything
     except DamagedBlobError:
         return 0  # the unit meets the damage too, and is computed again with its inputs

@@ -143,7 +143,7 @@ class Publisher:
     def _placed_files(self, item: str, ref: ItemRef, to: str) -> dict[str, BlobRef]:
         """Return the files of a unit by their path in the output folder, after checking these paths."""
         files: dict[str, BlobRef] = {}
-        for target, blob in self._files(ref):
+        for target, blob in delivered_files(ref, self.store):
             name = self._placed(str(PurePosixPath(to) / target), item)
             if is_of_the_run(name):
                 raise ContractError(
@@ -208,19 +208,6 @@ class Publisher:
             self._patterns.add((parts[0], parts[1]))
         return _PLACEHOLDER.sub(lambda match: texts[match[0]], target)
 
-    def _files(self, ref: ItemRef) -> list[tuple[str, BlobRef]]:
-        """Return the target paths of a unit's files, and the blobs with their contents, without reading these."""
-        try:
-            meta = self.store.blobs.get(ref.parts["meta"])
-            assert isinstance(meta, dict)
-            files = [(target, ref.parts[str(number)]) for number, target in enumerate(meta["targets"])]
-            Files({target: self.out for target, _ in files}).check()
-        except (KeyError, TypeError, ValueError, AssertionError) as error:
-            raise DamagedBlobError(
-                f"a cached list of files ({ref.digest}) is not valid ({error}); it is computed again"
-            ) from error
-        return files
-
     def _clear(self, folder: Path) -> None:
         """Remove temporary files of killed runs from a folder, once."""
         if folder not in self._cleared:
@@ -245,6 +232,24 @@ class Publisher:
             self.set_aside[name] = set_aside(target).relative_to(self.out).as_posix()
         self.store.blobs.copy(blob, target)
         self.written.append(name)
+
+
+def delivered_files(ref: ItemRef, store: Store) -> list[tuple[str, BlobRef]]:
+    """Return the target paths of a unit's files, and the blobs with their contents, without reading these.
+
+    Raises:
+        DamagedBlobError: if the stored list of the files is not valid.
+    """
+    try:
+        meta = store.blobs.get(ref.parts["meta"])
+        assert isinstance(meta, dict)
+        files = [(target, ref.parts[str(number)]) for number, target in enumerate(meta["targets"])]
+        Files({target: store.root for target, _ in files}).check()
+    except (KeyError, TypeError, ValueError, AssertionError) as error:
+        raise DamagedBlobError(
+            f"a cached list of files ({ref.digest}) is not valid ({error}); it is computed again"
+        ) from error
+    return files
 
 
 def _cannot_write(path: Path, reason: str) -> str:

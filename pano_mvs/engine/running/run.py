@@ -28,6 +28,7 @@ from pano_mvs.engine.cache.maintenance import pack
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import Sample
 from pano_mvs.engine.executors.choose import SerialExecutor
+from pano_mvs.engine.executors.execute import failed_outcome
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.planning.forecast import settings_digest
 from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
@@ -331,7 +332,14 @@ class RunPass:
     def _dispatch(self, unit: Unit) -> bool:
         """Have a unit computed if there is memory for it; return False if it has to wait."""
         dispatcher = self._run.dispatcher
-        if not dispatcher.fits(unit):
+        try:
+            fits = dispatcher.fits(unit)
+        except (Exception, SystemExit) as error:  # of a plugin's function for its memory
+            self._duplicates[unit.key] = []
+            self._statistics.unit_started(unit.entry, unit.item)
+            self._end(FinishedJob(unit, failed_outcome(unit, self._store, error)))
+            return True
+        if not fits:
             if dispatcher:
                 return False
             self._statistics.unit_started(unit.entry, unit.item)

@@ -284,8 +284,8 @@ def _imports_in(tree: ast.AST) -> Iterator[_Import]:
                 yield from ((0, alias.name, ()) for alias in names)
             case ast.ImportFrom(module=module, names=names, level=level):
                 yield level, module or "", tuple(alias.name for alias in names)
-            case ast.If(test=ast.Name(id="TYPE_CHECKING") | ast.Attribute(attr="TYPE_CHECKING")):
-                pass
+            case ast.If(test=ast.Name(id="TYPE_CHECKING") | ast.Attribute(attr="TYPE_CHECKING"), orelse=others):
+                yield from _imports_in(ast.Module(others, []))
             case ast.Call(
                 func=ast.Name(id=name) | ast.Attribute(attr=name), args=[ast.Constant(value=str(module)), *_]
             ) if name in _DYNAMIC_IMPORTS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -15,6 +15,7 @@ from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_o
 from pano_mvs.core.text import shortened_list
 from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif, position_from_exif, read_container
 from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".insp"})
@@ -225,7 +226,9 @@ Layout = Literal["auto", "side_by_side", "folders", "suffixes"]
 class RigPictures:
     """The pictures of one capture of a rig."""
 
-    name: str  # path relative to the folder, without the lens and with the extension .png
+    # path relative to the folder, without the lens and with the extension .png, before which that of its files is kept
+    # if two captures would have the same name
+    name: str
     files: tuple[Path, ...]  # the file that contains both pictures side by side, or the file of each lens
     problem: str = ""  # why the capture is incomplete; empty if it is complete
 
@@ -250,7 +253,8 @@ def list_rig_pictures(
     if layout == "auto":
         layout = _layout(names, lens_names)
     if layout == "side_by_side":
-        return [RigPictures(str(name.with_suffix(".png")), (path,)) for name, path in zip(names, paths, strict=True)]
+        stems = item_stems(map(str, names))
+        return [RigPictures(f"{stems[str(name)]}.png", (path,)) for name, path in zip(names, paths, strict=True)]
     found = list(_pairs(paths, names, lens_names=lens_names, layout=layout))
     if not found:
         example = f"{lens_names[0]}/000.jpg" if layout == "folders" else f"000_{lens_names[0]}.jpg"
@@ -271,25 +275,43 @@ def _layout(names: Sequence[PurePosixPath], lens_names: Sequence[str]) -> Layout
 def _pairs(
     paths: Sequence[Path], names: Sequence[PurePosixPath], *, lens_names: Sequence[str], layout: Layout
 ) -> Iterator[RigPictures]:
-    captures: dict[str, dict[int, Path]] = {}
+    captures: dict[str, dict[int, list[Path]]] = {}
     for path, name in zip(paths, names, strict=True):
         found = _lens_of(name, lens_names, layout)
         if found is None:
             captures.setdefault(str(name), {})
             continue
         lens_idx, shared = found
-        captures.setdefault(shared, {}).setdefault(lens_idx, path)
+        captures.setdefault(shared, {}).setdefault(lens_idx, []).append(path)
     if not any(captures.values()):
         return
+    name_of = dict(zip(paths, names, strict=True))
     for shared, files in captures.items():
         if not files:
             yield RigPictures(shared, (), f"does not belong to a lens: no {layout} {' or '.join(lens_names)}")
             continue
-        missing = [name for idx, name in enumerate(lens_names) if idx not in files]
-        problem = f"the picture of the lens {missing[0]} is missing" if missing else ""
-        if len({file.suffix for file in files.values()}) > 1:
-            problem = "the pictures of its lenses have different formats; save both in the same"
-        yield RigPictures(f"{shared}.png", tuple(files[idx] for idx in sorted(files)), problem)
+        for stem, group in _by_format(shared, files):
+            missing = [lens for idx, lens in enumerate(lens_names) if idx not in group]
+            problem = f"the picture of the lens {missing[0]} is missing" if missing else ""
+            used = tuple(group[idx][0] for idx in sorted(group))
+            if len({file.suffix for file in used}) > 1:
+                problem = "the pictures of its lenses have different formats; save both in the same"
+            yield RigPictures(f"{stem}.png", used, problem)
+            for first, *others in group.values():
+                for other in others:
+                    why = f"shows the same capture and lens as {name_of[first]}; rename or remove one of them"
+                    yield RigPictures(str(name_of[other]), (), why)
+
+
+def _by_format(shared: str, files: Mapping[int, list[Path]]) -> Iterator[tuple[str, dict[int, list[Path]]]]:
+    """Yield the names and the files of a capture; if a lens has several files, each format is a capture of its own."""
+    suffixes = dict.fromkeys(path.suffix for paths in files.values() for path in paths)
+    if len(suffixes) == 1 or all(len(paths) == 1 for paths in files.values()):
+        yield shared, dict(files)
+        return
+    for suffix in suffixes:
+        same = {idx: [path for path in paths if path.suffix == suffix] for idx, paths in files.items()}
+        yield shared + suffix, {idx: paths for idx, paths in same.items() if paths}
 
 
 def _lens_of(name: PurePosixPath, lens_names: Sequence[str], layout: Layout) -> tuple[int, str] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -25,25 +27,40 @@ from pano_mvs.algorithms.blocks import (
     merge_blocks,
 )
 from pano_mvs.algorithms.poses.verification.belief.doubts import probability_of, with_later_evidence
-from pano_mvs.core.digest import digest_from_file
-from pano_mvs.core.errors import InputError, StoreError, UsageError
+from pano_mvs.core.errors import ContractError, InputError, StoreError, UsageError
 from pano_mvs.core.file_names import PAIR_SEPARATOR
-from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, is_full_disk, temporary_prefix
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, is_full_disk, remove_whole, temporary_prefix
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.core.text import plural
+from pano_mvs.engine.cache.blobs import BlobRef
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.executors.execute import unit_outcome
+from pano_mvs.engine.executors.threads import available_threads
+from pano_mvs.engine.planning.unit_keys import single_unit
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
-from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.running.publish import delivered_files
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, StageSpec
+from pano_mvs.engine.workflows.policy import Policy
+from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.io.growing_arrays import GrowingArrays
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.ply import open_ply_points
 from pano_mvs.report.page import gather_report, write_page
-from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
+from pano_mvs.results.records import (
+    CloudSummary,
+    ImageReason,
+    MergedSummary,
+    PairLink,
+    StageOutcome,
+    ViewSummary,
+    WorkflowSummary,
+)
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, RunSummary
-from pano_mvs.scene import Files, PointCloud, Poses
+from pano_mvs.scene import Files, PointCloud, Poses, Record
 from pano_mvs.session.merging.files import Block, MergeFiles, load_blocks
+from pano_mvs.session.running import min_free_bytes
 from pano_mvs.session.summarise import poses_summary
 
 _STAGE = "merge"
@@ -365,22 +382,23 @@ def _repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) ->
     notes = [f"of each block, and not merged: the files of {', '.join(left_out)}"] if left_out else []
     if not repeated or not has_cloud:
         return written, notes
-    with _merged_cloud(files.out) as (cloud, scratch):
-        for number, (outcome, spec) in enumerate(repeated):
-            ctx = Context(np.random.default_rng(0), scratch / f"export_{number}")
-            try:
-                ctx.scratch.mkdir()
-                made = _export(spec, outcome.params, (cloud, files.merged.poses), ctx=ctx)
-                if clashes := [target for target in made.files if target in written]:
-                    raise InputError(f"another export has written {clashes[0]}")
-                for target, path in made.files.items():
-                    copy_file(path, files.to_write(target))
-                    written[target] = digest_from_file(path)
-            except Exception as error:  # also of a library
-                if is_full_disk(error) or is_full_disk(error.__cause__):
-                    raise _cannot_write(files.out, error) from error
-                notes.append(f"{spec.name} was not repeated for the merged capture: {error}")
-            notes += [f"{spec.name}: {note}" for note in ctx.notes]
+    try:
+        with _merged_inputs(files) as (store, inputs):
+            for outcome, spec in repeated:
+                try:
+                    made, told = _export(outcome, spec, inputs, store=store)
+                    notes += told
+                    if clashes := [target for target in made if target in written]:
+                        raise InputError(f"another export has written {clashes[0]}")
+                    for target, blob in made.items():
+                        store.blobs.copy(blob, files.to_write(target))
+                        written[target] = blob.digest
+                except Exception as error:  # also of a library
+                    if is_full_disk(error) or is_full_disk(error.__cause__):
+                        raise _cannot_write(files.out, error) from error
+                    notes.append(f"{spec.name} was not repeated for the merged capture: {error}")
+    except ContractError as error:
+        notes.append(f"no export was repeated for the merged capture: {error}")
     return written, notes
 
 
@@ -391,37 +409,51 @@ def _is_repeated(spec: StageSpec) -> bool:
     return is_own and all(port.cardinality is Cardinality.ONE and port.kind in (PointCloud, Poses) for port in needed)
 
 
-def _export(spec: StageSpec, params: Mapping[str, object], merged: tuple[PointCloud, Poses], *, ctx: Context) -> Files:
-    extras = {"params": spec.params_type.model_validate(params), "ctx": ctx}
-    cloud, poses = merged
-    inputs = {port.name: {PointCloud: cloud, Poses: poses}.get(port.kind) for port in spec.ports}
-    made = spec.function(**inputs, **{name: extras[role] for name, role in spec.extras.items()})
-    assert isinstance(made, Files)
-    made.check()
-    return made
+def _export(
+    outcome: StageOutcome, spec: StageSpec, inputs: Mapping[type[Record], ItemRef], *, store: Store
+) -> tuple[dict[str, BlobRef], list[str]]:
+    """Return the stored files of an export by target, and its notes, computed as a unit of a run."""
+    entry = StageEntry(outcome.name, spec, spec.params_type.model_validate(outcome.params), Policy(use=spec.name), "")
+    unit = single_unit(entry, {port.name: inputs.get(port.kind) for port in spec.ports}, store)
+    ended = unit_outcome(unit, store, threads=available_threads(), log=store.blobs.temporary / f"{unit.key}.txt")
+    if ended.error == "StoreError":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    if ended.record is None:
+        raise InputError(ended.cause)
+    notes = [f"{spec.name}: {note}" for note in ended.record.notes]
+    return dict(delivered_files(ended.record.output, store)), notes
 
 
 @contextmanager
-def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
-    """Yield the cloud in cloud.ply, with its arrays in files, and a folder that is deleted afterwards.
+def _merged_inputs(files: MergeFiles) -> Iterator[tuple[Store, dict[type[Record], ItemRef]]]:
+    """Yield a cache that is deleted afterwards, and in it the merged poses and the cloud in cloud.ply.
 
     Points of blocks that do not state how many views agree on them count as confirmed.
     """
     with ExitStack() as stack:
         try:
-            name = stack.enter_context(
-                TemporaryDirectory(dir=out, prefix=temporary_prefix(), ignore_cleanup_errors=True)
+            folder = stack.enter_context(
+                TemporaryDirectory(dir=files.out, prefix=temporary_prefix(), ignore_cleanup_errors=True)
             )
-            with GrowingArrays(Path(name) / "cloud") as grown:
-                for part in open_ply_points(out / "cloud.ply").cloud_chunks():
+            store = Store(Path(folder) / "cache", min_free_bytes=min_free_bytes())
+            with GrowingArrays(Path(folder) / "cloud") as grown:
+                for part in open_ply_points(files.out / "cloud.ply").cloud_chunks():
                     grown.append({array: getattr(part, array) for array in _ARRAYS})
+            arrays: dict[str, Any] = grown.arrays()
+            unknown = arrays["view_counts"] == 0
+            for array in ("view_counts", "confidence"):
+                arrays[array][unknown] = 255
+            if not np.isfinite(arrays.get("uncertainty", np.nan)).all():  # a block does not state it
+                arrays["uncertainty"] = None
+            inputs: dict[type[Record], ItemRef] = {
+                PointCloud: store.put_value(PointCloud(**arrays)),
+                Poses: store.put_value(files.merged.poses),
+            }
+            del arrays
+            remove_whole(Path(folder) / "cloud")
         except OSError as error:
-            raise _cannot_write(out, error) from error
-        arrays: dict[str, Any] = grown.arrays()
-        unknown = arrays["view_counts"] == 0
-        for array in ("view_counts", "confidence"):
-            arrays[array][unknown] = 255
-        yield PointCloud(**arrays), Path(name)
+            raise _cannot_write(files.out, error) from error
+        yield store, inputs
 
 
 def _cannot_write(out: Path, error: BaseException) -> StoreError:

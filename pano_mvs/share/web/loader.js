@@ -2,37 +2,40 @@
 // Data arrive as scripts that call `PanoMvs.receive`: a page from a disk may load scripts, but read no other files.
 const PanoMvs = {
   values: new Map(),
-  waiting: new Map(),
+  waiting: new Map(), // the key of each piece of data that is on its way, to its promise and what keeps that
   loaded: [], // the keys of all pieces of data, in the order in which the page asked for them
 
   receive(key, value) {
     const waiting = this.waiting.get(key);
-    if (waiting) {
-      this.waiting.delete(key);
-      waiting(value);
-    } else {
-      this.values.set(key, value);
-    }
+    if (waiting) waiting.resolve(value);
+    else this.values.set(key, value);
   },
 
   /** Return a promise of a piece of data; the page does not keep it. */
   load(key) {
     this.loaded.push(key);
     if (this.values.has(key)) return Promise.resolve(this.values.get(key)); // part of a single file
-    return new Promise((resolve, reject) => {
+    if (!this.waiting.has(key)) this.waiting.set(key, this.ask(key));
+    return this.waiting.get(key).promise;
+  },
+
+  /** Load the script of a piece of data; return a promise of the piece, and the function that keeps it. */
+  ask(key) {
+    const asked = {};
+    asked.promise = new Promise((resolve, reject) => {
       const script = document.createElement("script");
-      this.waiting.set(key, (value) => {
+      const ended = (then) => (value) => {
+        if (this.waiting.get(key) === asked) this.waiting.delete(key); // not if it was asked for again
         script.remove();
-        resolve(value);
-      });
-      script.onerror = () => {
-        this.waiting.delete(key);
-        script.remove();
-        reject(new Error(`data/${key}.js is missing`));
+        then(value);
       };
+      asked.resolve = ended(resolve);
+      script.onerror = ended(() => reject(new Error(`data/${key}.js is missing`)));
+      script.onload = ended(() => reject(new Error(`data/${key}.js is damaged`))); // without effect if data arrived
       script.src = `data/${key}.js`;
       document.head.append(script);
     });
+    return asked;
   },
 };
 

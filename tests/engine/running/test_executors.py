@@ -26,7 +26,8 @@ from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
 from pano_mvs.engine.executors.unit_requests import unit_from_json, unit_to_json, write_large_inputs
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.events import Observer, RunResult
+from pano_mvs.engine.running import run as run_module
+from pano_mvs.engine.running.events import Observer, RunResult, UnitStarted
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.stage_code import stage_code
 from tests.engine.conftest import Toy, ran
@@ -517,6 +518,51 @@ time.sleep(3600)
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.01)
     assert threading.active_count() == before
+
+
+def test_a_job_that_a_thread_takes_meanwhile_does_not_block_an_interrupt(tmp_path: Path) -> None:
+    """Jobs were removed from a queue that was not empty a moment before, which waits for ever once it is."""
+
+    class Jobs(queue.SimpleQueue[Any]):
+        def empty(self) -> bool:
+            return False
+
+    executor = ProcessExecutor(Store(tmp_path), workers=1, threads=1)
+    executor._jobs = Jobs()
+    thread = threading.Thread(target=executor.cancel, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert not thread.is_alive()
+
+
+def test_a_process_that_starts_during_an_interrupt_is_ended(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It computed its unit to the end, and the command waited for it."""
+    toy.begin("time.sleep(3600)", of="Read a number.")
+    start, starting, interrupted = worker_process.WorkerProcess._start, threading.Event(), threading.Event()
+
+    def start_late(self: worker_process.WorkerProcess) -> object:
+        starting.set()
+        assert interrupted.wait(30.0)
+        return start(self)
+
+    cancel = ProcessExecutor.cancel
+
+    def cancel_before(self: ProcessExecutor) -> None:
+        cancel(self)
+        interrupted.set()
+
+    def interrupt(event: object) -> None:
+        if isinstance(event, UnitStarted) and event.item == "2.txt":
+            assert starting.wait(30.0)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(worker_process.WorkerProcess, "_start", start_late)
+    monkeypatch.setattr(ProcessExecutor, "cancel", cancel_before)
+    monkeypatch.setattr(run_module, "GRACE_S", 0.0)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        run_with(toy, two_processes, observer=interrupt)
+    assert 0.5 < time.monotonic() - began < 60
 
 
 @pytest.mark.slow

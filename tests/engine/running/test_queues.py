@@ -10,6 +10,7 @@ import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from pano_mvs.engine.executors import queues
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.dask_cluster import run_unit
 from pano_mvs.engine.executors.protocol import JobOutcome
-from pano_mvs.engine.executors.queues import SYSTEMS, cluster_class, job_settings, patient, read_queue
+from pano_mvs.engine.executors.queues import SYSTEMS, QueueExecutor, cluster_class, job_settings, patient, read_queue
 
 SETTINGS = """\
 partition: long
@@ -124,6 +125,33 @@ def test_what_is_missing_is_refused_with_the_remedy(
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
     with pytest.raises(UsageError, match=r"needs dask_jobqueue: pip install 'pano-mvs\[queues\]'"):
         make_executor(store, "slurm", queue=file)
+
+
+@pytest.mark.usefixtures("commands")
+@pytest.mark.filterwarnings("ignore")  # of dask, whose loops are left to the collector
+def test_an_interface_that_does_not_exist_is_refused_and_no_keys_stay(file: Path, tmp_path: Path) -> None:
+    """It was reported as an internal error, and the keys of the connection stayed in the cache."""
+    file.write_text(SETTINGS.replace("interface: lo", "interface: nothing0"))
+    with pytest.raises(
+        UsageError, match=r"'nothing0' is not a valid network interface.* Check `interface` in the file"
+    ):
+        make_executor(Store(tmp_path / "cache"), "slurm", queue=file)
+    assert not list((tmp_path / "cache" / "tmp").iterdir())
+
+
+@pytest.mark.usefixtures("commands")
+@pytest.mark.filterwarnings("ignore")
+def test_no_keys_stay_if_the_scheduler_cannot_be_used(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: QueueExecutor, store: Store, cluster: Any) -> None:
+        cluster.close()
+        raise UsageError("it does not answer")
+
+    monkeypatch.setattr(QueueExecutor, "_connect", fail)
+    with pytest.raises(UsageError, match="it does not answer"):
+        make_executor(Store(tmp_path / "cache"), "slurm", queue=file)
+    assert not list((tmp_path / "cache" / "tmp").iterdir())
 
 
 @pytest.mark.usefixtures("commands")

@@ -193,6 +193,47 @@ def test_suffixes_of_names(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (
+            ["front/a.jpg", "front/a.png", "back/a.jpg", "back/a.png"],
+            [
+                ("a.jpg.png", ["front/a.jpg", "back/a.jpg"], ""),
+                ("a.png.png", ["front/a.png", "back/a.png"], ""),
+            ],
+        ),
+        (
+            ["front/a.jpg", "front/a.png", "back/a.jpg"],
+            [
+                ("a.jpg.png", ["front/a.jpg", "back/a.jpg"], ""),
+                ("a.png.png", ["front/a.png"], "the picture of the lens back is missing"),
+            ],
+        ),
+        (
+            ["a-front.jpg", "a_front.jpg", "a_back.jpg"],
+            [
+                ("a.png", ["a-front.jpg", "a_back.jpg"], ""),
+                (
+                    "a_front.jpg",
+                    [],
+                    "shows the same capture and lens as a-front.jpg; rename or remove one of them",
+                ),
+            ],
+        ),
+        (
+            ["a.jpg", "a.png", "b.png"],
+            [("a.jpg.png", ["a.jpg"], ""), ("a.png.png", ["a.png"], ""), ("b.png", ["b.png"], "")],
+        ),
+    ],
+)
+def test_no_file_is_dropped_in_silence(
+    tmp_path: Path, names: list[str], expected: list[tuple[str, list[str], str]]
+) -> None:
+    """Of two files of the same capture and lens, only the first was used, and the second was not named anywhere."""
+    assert listed(tmp_path, names) == expected
+
+
 def test_other_files_show_both_lenses(tmp_path: Path) -> None:
     assert listed(tmp_path, ["1.jpg", "2.jpg", "setback.jpg"]) == [
         (f"{name}.png", [f"{name}.jpg"], "") for name in ("1", "2", "setback")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks import MergedBlocks, nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.engine.executors.threads import available_threads
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.ply import read_ply, write_ply
@@ -21,7 +26,7 @@ from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Files, Poses
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.session.merging.files import MergeFiles, load_blocks
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
@@ -413,6 +418,35 @@ def test_an_export_that_fails_is_named_and_loses_nothing(tmp_path: Path) -> None
     for use in ("export.mesh", "export.tiles_3d"):
         assert any(f"{use} was not repeated for the merged capture" in note for note in merged.summary.notes)
     assert (tmp_path / "merged/cloud.ply").is_file()
+
+
+def test_exports_are_computed_as_units_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They had one thread, and the same random numbers whatever their settings; sys.exit in one ended the merge."""
+    registry = Registry.installed()
+    spec = registry.stages["export.floor_plan"]
+    draws: list[tuple[int, float]] = []
+
+    def probe(params: Params, ctx: Context, **_: object) -> Files:
+        draws.append((ctx.threads, ctx.rng.random()))
+        if len(draws) == 4:
+            sys.exit("enough")
+        ctx.note("as a unit")
+        (ctx.scratch / "plan.txt").write_text("plan")
+        return Files({f"floor_plan/{len(draws)}.txt": ctx.scratch / "plan.txt"})
+
+    registry.stages["export.floor_plan"] = replace(spec, function=probe, extras={"params": "params", "ctx": "ctx"})
+    monkeypatch.setattr(Registry, "installed", lambda: registry)
+    monkeypatch.setattr("pano_mvs.session.merging.merge._is_repeated", lambda _: True)
+    plans = [StageOutcome(name=f"plan_{n}", use=spec.name, params={"width_px": 100 * n}) for n in (3, 4)]
+    outs = with_exports(tmp_path, *plans)
+    merged = merge_outputs(outs, tmp_path / "merged")
+    assert {"floor_plan/1.txt", "floor_plan/2.txt"} == {*merged.summary.files}
+    assert "export.floor_plan: as a unit" in merged.summary.notes
+    again = merge_outputs(outs, tmp_path / "again")
+    assert any("was not repeated for the merged capture: " in note and "enough" in note for note in again.summary.notes)
+    assert draws[:2] == draws[2:]
+    assert draws[0][1] != draws[1][1] != np.random.default_rng(0).random() != draws[0][1]
+    assert {threads for threads, _ in draws} == {available_threads()}
 
 
 def test_exports_of_an_earlier_merge_do_not_stay(tmp_path: Path) -> None:
