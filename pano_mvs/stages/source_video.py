@@ -26,7 +26,7 @@ from pano_mvs.io.images.video import KeptFile, VideoInfo, describe_video, frames
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.stereo import StereoSetting
-from pano_mvs.stages.source import STEREO, stereo_note, working_size
+from pano_mvs.stages.source import STEREO, masked_panorama, stereo_note, working_size
 
 # Motion is measured in at most this number of frames per second.
 _MEASURED_PER_S = 15.0
@@ -158,8 +158,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
     )
-    ctx.metric("valid", float(panorama.load_mask().mean()))
-    return panorama
+    return masked_panorama(panorama, None, item.name, ctx)
 
 
 def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:

@@ -200,7 +200,7 @@ def test_what_is_no_panorama_must_be_stitched_first(tmp_path: Path, name: str, p
 def test_what_the_camera_records_before_stitching_is_known_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "VID_1.insv").write_bytes(b"x")
     for path in (tmp_path, tmp_path / "VID_1.insv"):
-        with pytest.raises(InputError, match=r"equirectangular video with the camera maker's program first"):
+        with pytest.raises(InputError, match=r"VID_1\.insv, which a camera .*equirectangular video"):
             list(list_frames(params(path)))
 
 
