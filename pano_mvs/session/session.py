@@ -215,7 +215,9 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
     # A relative folder is relative to where the run was started; the settings contain the absolute path.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
     given = [
-        f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
+        f"images.path={folder if isinstance(folder, str) else json.dumps(folder)}"
+        if one.startswith("images.path=") and folder
+        else one
         for one in summary.workflow.overrides
     ]
     if cache is None and summary.cache:
