@@ -175,6 +175,25 @@ def frames_between(
             has_frame = capture.grab()
 
 
+def frame_on_display(
+    path: Path, time_s: float, *, threads: int = 1, stereo: StereoLayout = "none"
+) -> tuple[float, NDArray[np.uint8]] | None:
+    """Return the time and image of the frame that a player shows at a time between two frames, as `frames_between`.
+
+    Returns:
+        None if no later frame can be decoded: then the video is damaged, or ends before.
+    """
+    shown_s = None
+    with _opened(path, threads) as capture:
+        has_frame = _seek(capture, time_s)
+        while has_frame and (next_s := capture.get(cv2.CAP_PROP_POS_MSEC) / 1000) <= time_s + _SLACK_S:
+            shown_s = next_s
+            has_frame = capture.grab()
+    if shown_s is None or not has_frame:
+        return None
+    return next(frames_between(path, shown_s, shown_s, threads=threads, stereo=stereo), None)
+
+
 def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
     """Seek a frame at or before a time; return whether it exists.
 
