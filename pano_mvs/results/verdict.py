@@ -157,8 +157,8 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
 def _masks(summary: RunSummary) -> Iterator[Finding]:
     """Yield a finding if masks hide most of the images: they may be inverted, and little overlap is left."""
     for stage in summary.stages:
-        masked = stage.metrics.get("masked", 0.0)
-        if masked > 0.5:
+        masked = stage.metrics.get("masked")
+        if masked is not None and masked > 0.5:
             yield Finding(
                 "bad" if summary.stopped else "fair",
                 f"The masks hide {share(masked)} of what the images show, in the mean of the images that have one.",

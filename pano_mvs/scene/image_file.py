@@ -243,7 +243,8 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
         np.right_shift(image, 8, out=image)  # programs write 8 bits v in 16 as 257 v or 256 v; both give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
     if image.dtype in (np.float32, np.float64):
-        return _tone_mapped(image[..., ::-1])
+        with np.errstate(over="ignore"):
+            return _tone_mapped(np.asarray(image[..., ::-1], np.float32))
     if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} images are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # in place
@@ -287,12 +288,12 @@ def _decode_exr(data: bytes, path: Path) -> NDArray[np.float32]:
     return np.stack([channels[name] for name in "RGB"], axis=-1)
 
 
-_LUMINANCE = np.float32([0.2126, 0.7152, 0.0722])  # of linear RGB, ITU-R BT.709
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB, ITU-R BT.709
 _MIDDLE_GREY = 0.18
 _ROWS_AT_ONCE = 64
 
 
-def _tone_mapped(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+def _tone_mapped(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return an image of linear colours, (H, W, 3) RGB of any range, as 8-bit sRGB.
 
     The geometric mean of the luminances becomes middle grey, and each colour c becomes c / (1 + c), as in Reinhard et
@@ -304,12 +305,12 @@ def _tone_mapped(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     total, count = 0.0, 0
     with np.errstate(all="ignore"):
         for rows in spans:
-            luminances = linear[rows].astype(np.float32) @ _LUMINANCE
+            luminances = linear[rows] @ _LUMINANCE
             luminances = luminances[np.isfinite(luminances) & (luminances > 0)]
             total, count = total + float(np.log(luminances).sum(dtype=np.float64)), count + luminances.size
         exposure = np.float32(_MIDDLE_GREY / np.exp(total / count) if count else 1.0)
         for rows in spans:
-            scaled = np.fmax(linear[rows].astype(np.float32), 0) * exposure
+            scaled = np.fmax(linear[rows], 0) * exposure
             shown = 1 - 1 / (1 + scaled)
             srgb = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** np.float32(1 / 2.4) - 0.055)
             mapped[rows] = np.rint(255 * srgb)
@@ -327,7 +328,7 @@ def decode_opacity(path: Path, data: bytes, *, max_pixels: int = MAX_PIXELS) -> 
     picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED, max_pixels=max_pixels)
     if picture is None or picture.ndim != 3 or picture.shape[2] not in (2, 4):
         return None
-    shown = np.asarray(picture[..., -1] > 0)
+    shown = np.asarray(picture[..., -1] != 0)
     return None if shown.all() else shown
 
 

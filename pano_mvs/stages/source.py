@@ -203,7 +203,7 @@ def masked_panorama(panorama: Panorama, opaque: Mask | None, name: str, ctx: Con
         masked = float(areas @ (shown & ~valid).sum(axis=1) / max(areas @ shown.sum(axis=1), 1e-9))
         ctx.metric("masked", masked)
         if masked > 0.5:
-            ctx.note(f"the masks of {{count}} images hide most of what they show. {MEANING_OF_MASKS}")
+            ctx.note(f"{{count}} images have masks that hide most of what they show. {MEANING_OF_MASKS}")
     return panorama
 
 

@@ -84,11 +84,12 @@ def hdr_files(linear: np.ndarray, folder: Path) -> list[Path]:
 @pytest.mark.parametrize("brightness", [1e-4, 1.0, 1e6])
 def test_hdr_pictures_are_tone_mapped_whatever_their_brightness(tmp_path: Path, brightness: float) -> None:
     """They were skipped without a word, and floating-point TIFF files were refused."""
-    levels = np.linspace(0.05, 4.0, SIZE[1], dtype=np.float32)
-    linear = np.broadcast_to(levels[:, None], (*SIZE, 3)) * np.float32([1.2, 1.0, 0.8]) * np.float32(brightness)
-    for path in hdr_files(np.ascontiguousarray(linear), tmp_path):
+    levels = brightness * np.linspace(0.05, 4.0, SIZE[1])
+    linear = np.broadcast_to(np.outer(levels, [1.2, 1.0, 0.8]), (*SIZE, 3)).astype(np.float32)
+    for path in hdr_files(linear, tmp_path):
         decoded = decode_image(path)
-        assert (decoded.dtype, decoded.shape) == (np.uint8, (*SIZE, 3))
+        assert decoded.dtype == np.uint8
+        assert decoded.shape == (*SIZE, 3)
         assert decoded[0, 0, 0] > decoded[0, 0, 1] > decoded[0, 0, 2] > 10, "red is first"
         assert (np.diff(decoded[0].astype(int), axis=0) >= 0).all()
         assert 130 < decoded[0, -1, 1] < 255, "the brightest does not clip"
@@ -99,7 +100,7 @@ def test_hdr_pictures_are_tone_mapped_whatever_their_brightness(tmp_path: Path, 
 
 def test_values_that_no_colour_has_do_not_spoil_an_hdr_picture(tmp_path: Path) -> None:
     linear = np.full((*SIZE, 3), 0.5, np.float32)
-    linear[0, :4] = np.float32([np.nan, np.inf, -np.inf, -1])[:, None]
+    linear[0, :4] = np.array([np.nan, np.inf, -np.inf, -1])[:, None]
     for path in hdr_files(linear, tmp_path)[1:]:  # Radiance files cannot hold them
         decoded = decode_image(path)
         assert decoded[0, :4, 0].tolist() == [0, 255, 0, 0]

@@ -203,5 +203,7 @@ def test_masks_that_hide_most_say_what_their_values_mean(capture: Path, masked: 
     """With inverted masks, which hid 78 % of the sphere, the advice was to take panoramas closer together."""
     write_mask(capture / "masks" / "3.png", masked=masked)
     _, notes = read_folder(capture / "photos", masks=capture / "masks")
-    warned = [note for note in notes if "hide most of what they show. 0 (black) in a mask means ignored" in note]
+    warned = [
+        note for note in notes if "masks that hide most of what they show. 0 (black) in a mask means ignored" in note
+    ]
     assert len(warned) == (masked.start > 0)
