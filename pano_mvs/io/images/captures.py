@@ -19,8 +19,9 @@ from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
 from pano_mvs.scene.image_header import holds_floats, is_map, of_file
 
-_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".insp"})
-PICTURE_SUFFIXES = _JPEG_SUFFIXES | {".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hdr", ".exr"}
+_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".insp"})
+_HEIF_SUFFIXES = frozenset({".avif", ".heic", ".heif", ".hif"})
+PICTURE_SUFFIXES = _JPEG_SUFFIXES | _HEIF_SUFFIXES | {".png", ".tif", ".tiff", ".webp", ".hdr", ".exr"}
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
 UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _FISHEYE_SUFFIXES = UNSTITCHED_SUFFIXES - {".360"}  # which shows the faces of a cube
@@ -28,8 +29,8 @@ _RAW_SUFFIXES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".gpr", ".iiq", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 _OTHER_PICTURES = _RAW_SUFFIXES | {
-    *(".bmp", ".dib", ".gif", ".j2k", ".jp2", ".jpf", ".jpx", ".jxl", ".jxr", ".mpo", ".pam", ".pbm", ".pfm", ".pgm"),
-    *(".pic", ".pnm", ".ppm", ".psb", ".psd", ".ras", ".rgbe", ".tga"),
+    *(".bmp", ".dib", ".gif", ".j2k", ".jp2", ".jpf", ".jps", ".jpx", ".jxl", ".jxr", ".mpo", ".pam", ".pbm"),
+    *(".pcx", ".pfm", ".pgm", ".pic", ".pnm", ".ppm", ".psb", ".psd", ".ras", ".rgbe", ".tga", ".xcf"),
 }
 _MAP_SUFFIXES = frozenset({".tif", ".tiff", ".exr"})
 _IGNORED_FOLDERS = frozenset({"masks"})

@@ -400,7 +400,10 @@ def test_paths_can_be_unset_and_listed(settings: Path, monkeypatch: pytest.Monke
     params = found.stages["many"].params.model_dump()
     assert (params["file"], params["files"]) == (None, [settings / "a", settings / "a"])
     text = TEXT.replace("retries: 3", "file: 20241128")
-    with pytest.raises(WorkflowError, match=r"wf\.yaml:4:\d+: stage 'many': file: .* put a name of digits in quotes"):
+    with pytest.raises(
+        WorkflowError,
+        match=r"wf\.yaml:4:\d+: stage 'many': file: YAML reads this as .*put the name of a file in quotes",
+    ):
         WorkflowReader("wf.yaml", settings, Registry()).read(text)
 
 
