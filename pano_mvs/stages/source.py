@@ -178,10 +178,10 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         heading_deg=info.gpano.heading_deg if info.gpano else None,
         position_lla=info.position_lla,
     )
-    return masked_panorama(panorama, opaque, item.name, ctx)
+    return masked_panorama(panorama, opaque, name=item.name, ctx=ctx)
 
 
-def masked_panorama(panorama: Panorama, opaque: Mask | None, name: str, ctx: Context) -> Panorama:
+def masked_panorama(panorama: Panorama, opaque: Mask | None, *, name: str, ctx: Context) -> Panorama:
     """Return a panorama whose transparent pixels are masked too, and report how much of it is masked.
 
     Args:
@@ -231,7 +231,7 @@ def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: Fo
         heading_deg=gpano.heading_deg if gpano else None,
         position_lla=position_from_exif(container.exif),
     )
-    return masked_panorama(panorama, opaque, item.name, ctx)
+    return masked_panorama(panorama, opaque, name=item.name, ctx=ctx)
 
 
 def stereo_note(what: str, layout: StereoLayout) -> str:

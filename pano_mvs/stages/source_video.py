@@ -169,7 +169,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
     )
-    return masked_panorama(panorama, None, item.name, ctx)
+    return masked_panorama(panorama, None, name=item.name, ctx=ctx)
 
 
 def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:

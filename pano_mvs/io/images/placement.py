@@ -51,7 +51,7 @@ def placed(path: Path, size_hw: tuple[int, int], gpano: GPano | None) -> Placeme
     full_hw = _sphere(gpano)
     if full_hw is None:
         return _full_sphere(path, size_hw, gpano)
-    (crop_width, crop_height), warnings = _crop_size(path, size_hw, full_hw, gpano)
+    (crop_width, crop_height), warnings = _crop_size(path, size_hw, gpano, full_hw=full_hw)
     if (crop_height, crop_width) == full_hw:
         if left or top:
             warnings = (
@@ -110,7 +110,7 @@ def _full_sphere(path: Path, size_hw: tuple[int, int], gpano: GPano) -> Placemen
 
 
 def _crop_size(
-    path: Path, size_hw: tuple[int, int], full_hw: tuple[int, int], gpano: GPano
+    path: Path, size_hw: tuple[int, int], gpano: GPano, *, full_hw: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[str, ...]]:
     """Return the width and height of the part of the sphere, in pixels of the sphere, and warnings."""
     height, width = size_hw
