@@ -15,6 +15,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_verdict
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import write_given
+from pano_mvs.core.kernel_cache import must_compile
 from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
@@ -115,6 +116,7 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
         size = size_text(round(run_plan.stored_bytes))
         text = f"{bound} {duration_text(run_plan.seconds)} with {workers}, and {size} in the cache, by earlier runs"
         text += f"; unknown: {shortened_list(unknown)}" if unknown else ""
+        text += "; compiling kernels, which the first run does once, is not included" if must_compile() else ""
     console.say(escape(text))
 
 

@@ -79,6 +79,11 @@ def count_compiled() -> int:
     return sum(name.endswith(".nbi") for name in names)
 
 
+def must_compile() -> bool:
+    """Return whether no kernel of this version has been compiled on this machine, which the first run does."""
+    return os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0") and not count_compiled()
+
+
 def user_cache_folder() -> Path:
     """Return the user's folder for caches, or else a folder of their own for temporary files.
 

@@ -149,6 +149,8 @@ def report_invalid(
             message = problem["msg"].removeprefix("Value error, ")
             if problem["type"] == "model_type":  # pydantic's message names the class
                 message = "must be a mapping of settings"
+            elif problem["type"] == "path_type" and isinstance(problem["input"], int | float):
+                message = "YAML reads this as a number or truth value; put the name of a file in quotes"
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
             setting = f"{key}: " if key else ""
             problems.add(found.place, f"{subject}{setting}{message} (got {shown})")

@@ -17,8 +17,9 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.poses.json_files import PosedView, read_posed_views
-from pano_mvs.io.ranges import keys_of_npz, read_confidence_png, read_exr, read_npy, read_npz
+from pano_mvs.io.ranges import keys_of_npz, read_confidence_png, read_npy, read_npz
 from pano_mvs.scene import FilePart, Poses, RangeMap
+from pano_mvs.scene.exr import read_exr
 from pano_mvs.scene.image_file import decode_picture
 from pano_mvs.scene.pose_groups import split_groups
 

@@ -6,7 +6,6 @@ another layout.
 
 from __future__ import annotations
 
-import importlib.util
 import lzma
 import math
 import struct
@@ -23,7 +22,8 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.text import shortened
 from pano_mvs.scene import FilePart
-from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
+from pano_mvs.scene.image_file import decode_picture
+from pano_mvs.scene.image_header import MAX_PIXELS
 
 _DEFLATE = 8  # TIFF's code of zlib compression, which every reader supports
 _MAX_STEP = 65535
@@ -202,53 +202,3 @@ def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
 def _reason(error: BaseException) -> str:
     """Return an exception's shortened text, or its type without one."""
     return shortened(str(error), 300) or type(error).__name__  # numpy repeats whole headers
-
-
-# The exceptions that OpenEXR raises for damaged files.
-_DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
-
-EXR_REMEDY = "EXR files need the package OpenEXR: pip install 'pano-mvs[exr]'"
-
-
-def has_exr() -> bool:
-    """Return whether EXR files can be written and read."""
-    return importlib.util.find_spec("OpenEXR") is not None
-
-
-def write_exr(path: Path, channels: dict[str, NDArray[np.float32]]) -> None:
-    """Write channels of one size as a scan-line EXR file, 32-bit float, with lossless ZIP compression."""
-    if not has_exr():
-        raise UsageError(EXR_REMEDY)
-    import OpenEXR
-
-    shapes = {array.shape for array in channels.values()}
-    if len(shapes) != 1 or any(array.dtype != np.float32 or array.ndim != 2 for array in channels.values()):
-        raise UsageError(f"channels of an EXR file are (H, W) float32 of one size, got {sorted(shapes)}")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    arrays = {name: np.ascontiguousarray(array) for name, array in channels.items()}
-    OpenEXR.File(header, arrays).write(str(path))
-
-
-def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the channels, name to (H, W) float32, of an EXR file.
-
-    Raises:
-        UsageError: if OpenEXR is not installed.
-        InputError: if the file cannot be read, or its header states more pixels than the limit.
-    """
-    if not has_exr():
-        raise UsageError(EXR_REMEDY)
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            (left, top), (right, bottom) = file.header()["dataWindow"]
-        width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
-        if width * height > MAX_PIXELS:
-            raise ValueError(f"its header states {width}×{height} px, more than the limit of {MAX_PIXELS}")
-        with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore", invalid="ignore"):
-            return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except _DAMAGE as error:
-        raise InputError(
-            f"{path}: not a readable EXR file ({str(error) or type(error).__name__}). Write it again"
-        ) from error

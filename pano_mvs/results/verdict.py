@@ -11,6 +11,7 @@ from pano_mvs.results.figures import degrees, figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary, Tile, Verdict
 from pano_mvs.results.residuals import Residuals
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RunSummary
+from pano_mvs.scene.masking import MEANING_OF_MASKS
 
 _OUTCOMES = {
     0: ("good", "Finished"),
@@ -138,6 +139,7 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
         residual_px: median reprojection residual in pixels of the panoramas, if known.
     """
     found = [
+        *_masks(summary),
         *_stopped(summary),
         *_failures(summary),
         *_registration(summary),
@@ -150,6 +152,18 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
         *_baseline(summary),
     ]
     return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
+
+
+def _masks(summary: RunSummary) -> Iterator[Finding]:
+    """Yield a finding if masks hide most of the images: they may be inverted, and little overlap is left."""
+    for stage in summary.stages:
+        masked = stage.metrics.get("masked")
+        if masked is not None and masked > 0.5:
+            yield Finding(
+                "bad" if summary.stopped else "fair",
+                f"The masks hide {share(masked)} of what the images show, in the mean of the images that have one.",
+                f"{MEANING_OF_MASKS}.",
+            )
 
 
 def _stopped(summary: RunSummary) -> Iterator[Finding]:
@@ -191,7 +205,7 @@ def _registration(summary: RunSummary) -> Iterator[Finding]:
         yield Finding("", text)
     else:
         remedy = "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well."
-        yield Finding(mood, text, remedy)
+        yield Finding(mood, text, "Correct the masks first." if any(_masks(summary)) else remedy)
 
 
 def doubt_mood(poses: PosesSummary) -> str:

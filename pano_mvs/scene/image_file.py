@@ -17,20 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.scene.exr import EXR_REMEDY, has_exr, read_exr
 from pano_mvs.scene.image_header import (
+    EXR_START,
     JPEG_START,
     PNG_START,
     TIFF_STARTS,
     Size,
+    exr_windows,
+    has_alpha,
+    holds_floats,
     is_cut_short,
+    of_file,
     stated_size,
     stated_size_of_file,
 )
+from pano_mvs.scene.image_header import MAX_PIXELS as MAX_PIXELS
 from pano_mvs.scene.record import FilePart
 
-MAX_PIXELS = 512_000_000  # default limit of pixels of an image that is decoded
 MASK_BYTES_PER_PIXEL = 8
 """Peak memory while a mask is read and resized: grey levels, flags, and counts of masked pixels."""
+ALPHA_BYTES_PER_PIXEL = 18
+"""Peak memory while the alpha channel of an image of 16 bits is read: the file, four samples, flags."""
 
 
 # Our own errors replace OpenCV's messages about images that it cannot decode.
@@ -55,7 +63,9 @@ _redirected = threading.Lock()
 
 def decoding_bytes_per_pixel(path: Path) -> int:
     """Return the peak memory in bytes per pixel of decoding an image file, including the file."""
-    # Measured worst cases, including the file: uncompressed TIFF of 16 bits, and PNG of 16 bits; JPEG takes 6.
+    # Measured worst cases, including the file: floats (HDR); uncompressed TIFF and PNG of 16 bits; JPEG takes 6.
+    if of_file(path, holds_floats):
+        return 40
     return 18 if path.suffix.lower() in {".tif", ".tiff"} else 8
 
 
@@ -197,9 +207,10 @@ _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", 
 
 
 def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
-    """Return an image as (H, W, 3) uint8 RGB. 16-bit images are scaled; EXIF orientation and transparency are ignored.
+    """Return an image as (H, W, 3) uint8 RGB; EXIF orientation and transparency are ignored.
 
-    Only the first page of an image with several pages is read.
+    16-bit images are scaled; floating-point ones (HDR) are tone-mapped. Only the first page of an image with several
+    pages is read.
 
     Raises:
         InputError: if the file cannot be read, is not an image, is truncated or damaged, is larger than the limit, or
@@ -210,6 +221,9 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS and b"avif" not in data[:64]:
         check_stated_size(data, path, max_pixels)
         return _decode_heic(data, path)
+    if data.startswith(EXR_START):
+        check_stated_size(data, path, max_pixels)
+        return _tone_mapped(_decode_exr(data, path))
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     if not data.startswith(PNG_START):  # whose 16 bits OpenCV reduces to 8 as we do, with half of the memory
         flags |= cv2.IMREAD_ANYDEPTH
@@ -228,6 +242,9 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
     if image.dtype == np.uint16:
         np.right_shift(image, 8, out=image)  # programs write 8 bits v in 16 as 257 v or 256 v; both give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
+    if image.dtype in (np.float32, np.float64):
+        with np.errstate(over="ignore"):
+            return _tone_mapped(np.asarray(image[..., ::-1], np.float32))
     if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} images are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # in place
@@ -251,6 +268,68 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
         ) from error
     rgb = image[..., :3] if image.ndim == 3 and image.shape[-1] >= 3 else np.atleast_3d(image)[..., :1].repeat(3, -1)
     return np.ascontiguousarray(rgb, dtype=np.uint8)
+
+
+def _decode_exr(data: bytes, path: Path) -> NDArray[np.float32]:
+    """Return the colours of an EXR image, (H, W, 3) RGB."""
+    if not has_exr():
+        raise InputError(f"{path}: {EXR_REMEDY}, or convert it to JPEG")
+    channels = read_exr(path, data)
+    if not {"R", "G", "B"} <= set(channels):
+        raise InputError(
+            f"{path}: has no channels R, G and B, but {', '.join(sorted(channels)) or 'none'}. Export its colours "
+            "under these names, or remove it"
+        )
+    stored, whole = exr_windows(data)
+    if stored != whole:
+        raise InputError(
+            f"{path}: stores only the part {stored} of its picture {whole} (columns and rows). Export all of it"
+        )
+    return np.stack([channels[name] for name in "RGB"], axis=-1)
+
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB, ITU-R BT.709
+_MIDDLE_GREY = 0.18
+_ROWS_AT_ONCE = 64
+
+
+def _tone_mapped(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an image of linear colours, (H, W, 3) RGB of any range, as 8-bit sRGB.
+
+    The geometric mean of the luminances becomes middle grey, and each colour c becomes c / (1 + c), as in Reinhard et
+    al., Photographic tone reproduction for digital images, 2002, equations 1 to 3. Negative values and NaN are black;
+    infinite ones are white.
+    """
+    mapped = np.empty(linear.shape, np.uint8)
+    spans = [slice(first, first + _ROWS_AT_ONCE) for first in range(0, len(linear), _ROWS_AT_ONCE)]
+    total, count = 0.0, 0
+    with np.errstate(all="ignore"):
+        for rows in spans:
+            luminances = linear[rows] @ _LUMINANCE
+            luminances = luminances[np.isfinite(luminances) & (luminances > 0)]
+            total, count = total + float(np.log(luminances).sum(dtype=np.float64)), count + luminances.size
+        exposure = np.float32(_MIDDLE_GREY / np.exp(total / count) if count else 1.0)
+        for rows in spans:
+            scaled = np.fmax(linear[rows], 0) * exposure
+            shown = 1 - 1 / (1 + scaled)
+            srgb = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** np.float32(1 / 2.4) - 0.055)
+            mapped[rows] = np.rint(255 * srgb)
+    return mapped
+
+
+def decode_opacity(path: Path, data: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.bool_] | None:
+    """Return where an image is not transparent, (H, W) bool; None if it is opaque, or does not say.
+
+    Raises:
+        InputError: as `decode_picture`.
+    """
+    if not has_alpha(data):
+        return None
+    picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED, max_pixels=max_pixels)
+    if picture is None or picture.ndim != 3 or picture.shape[2] not in (2, 4):
+        return None
+    shown = np.asarray(picture[..., -1] != 0)
+    return None if shown.all() else shown
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:

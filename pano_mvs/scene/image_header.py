@@ -2,37 +2,50 @@
 
 JPEG: ITU-T T.81, the start of frame. PNG: the chunk IHDR. WebP: the RIFF chunks VP8, VP8L and VP8X. TIFF: the first
 directory. HEIC and AVIF: the boxes `ispe` of ISO/IEC 23008-12, of which the largest is that of the whole image.
+Radiance HDR: its line of the resolution. EXR: the attributes of its first part.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 Size: TypeAlias = "tuple[int, int]"
-ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]  # `heif` includes AVIF
+Data: TypeAlias = bytes | mmap  # of an image file, in memory or mapped
+ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif", "hdr", "exr"]  # `heif` includes AVIF
+MAX_PIXELS = 512_000_000  # default limit of pixels of an image that is decoded
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+HDR_STARTS, EXR_START = (b"#?RADIANCE", b"#?RGBE"), b"v/1\x01"
 _WIDTH, _HEIGHT = 256, 257
+_COLORS, _SAMPLES, _EXTRA_SAMPLES, _SAMPLE_FORMAT = 262, 277, 338, 339
+_CMYK, _FLOATS, _ALPHAS = 5, 3, (1, 2)  # values of these fields; alpha is premultiplied (1) or not (2)
 _FIRST_BYTES = 1 << 16
 _HEIF_BYTES = 1 << 20
-_DAMAGE = (struct.error, IndexError, OverflowError)
+_DAMAGE = (struct.error, IndexError, OverflowError, KeyError, ValueError)
 
 
-def image_kind(data: bytes) -> ImageKind | None:
+def image_kind(data: Data) -> ImageKind | None:
     """Return the kind of an image file by its first bytes, or None for any other file."""
-    if data.startswith(JPEG_START):
+    start = data[:16]
+    if start.startswith(JPEG_START):
         return "jpeg"
-    if data.startswith(PNG_START):
+    if start.startswith(PNG_START):
         return "png"
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+    if start.startswith(b"RIFF") and start[8:12] == b"WEBP":
         return "webp"
-    if data.startswith(TIFF_STARTS):
+    if start.startswith(TIFF_STARTS):
         return "tiff"
-    return "heif" if data[4:8] == b"ftyp" else None
+    if start.startswith(HDR_STARTS):
+        return "hdr"
+    if start.startswith(EXR_START):
+        return "exr"
+    return "heif" if start[4:8] == b"ftyp" else None
 
 
 def stated_size(data: bytes) -> Size | None:
@@ -55,7 +68,7 @@ def stated_size_of_file(path: Path) -> Size | None:
         return None
 
 
-def riff_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+def riff_chunks(data: Data) -> Iterator[tuple[bytes, int, int]]:
     """Yield the chunks of a RIFF file, such as a WebP: kind, start and end of each."""
     offset = 12
     while offset + 8 <= len(data):
@@ -119,6 +132,49 @@ def _heif_size(data: bytes) -> Size | None:
     return _positive(*max(sizes, key=lambda size: size[0] * size[1])) if sizes else None
 
 
+def _hdr_size(data: bytes) -> Size | None:
+    found = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:_FIRST_BYTES])  # OpenCV reads no other order
+    return None if found is None else _positive(int(found[1]), int(found[2]))
+
+
+def _exr_size(data: bytes) -> Size | None:
+    _, (left, top, right, bottom) = exr_windows(data)
+    return _positive(max(0, bottom - top + 1), max(0, right - left + 1))
+
+
+def exr_windows(data: Data) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the part that an EXR file stores, and the whole picture: first column and row, last column and row.
+
+    Raises:
+        KeyError, struct.error, IndexError, ValueError: if it is damaged.
+    """
+    attributes = _exr_attributes(data)
+    return struct.unpack("<4i", attributes[b"dataWindow"]), struct.unpack("<4i", attributes[b"displayWindow"])
+
+
+def _exr_attributes(data: Data) -> dict[bytes, bytes]:
+    """Return the attributes of the first part of an EXR file by name."""
+    attributes: dict[bytes, bytes] = {}
+    offset = 8
+    while data[offset]:
+        name, kind, _ = data[offset : offset + 512].split(b"\0", 2)
+        offset += len(name) + len(kind) + 2
+        (length,) = struct.unpack_from("<I", data, offset)
+        attributes[name] = data[offset + 4 : offset + 4 + length]
+        offset += 4 + length
+    return attributes
+
+
+def _exr_channels(data: Data) -> set[bytes]:
+    """Return the names of the channels of the first part, each of which 17 bytes follow."""
+    listed, names = _exr_attributes(data)[b"channels"], set[bytes]()
+    while listed[:1] not in (b"", b"\0"):
+        name, _, rest = listed.partition(b"\0")
+        names.add(name)
+        listed = rest[16:]
+    return names
+
+
 def _positive(height: int, width: int) -> Size | None:
     return (height, width) if height and width else None
 
@@ -129,7 +185,66 @@ _READERS: Mapping[ImageKind, Callable[[bytes], Size | None]] = {
     "webp": _webp_size,
     "tiff": _tiff_size,
     "heif": _heif_size,
+    "hdr": _hdr_size,
+    "exr": _exr_size,
 }
+
+
+def of_file(path: Path, question: Callable[[Data], bool]) -> bool:
+    """Return the answer to one of the questions below for a file, of which little is read; False if it is not readable.
+
+    The directory of a TIFF may be at its end.
+    """
+    try:
+        with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+            return question(data)
+    except (OSError, ValueError):
+        return False
+
+
+def holds_floats(data: Data) -> bool:
+    """Return whether the pixels of an image are floating-point numbers, whose range is open (HDR)."""
+    kind = image_kind(data)
+    return kind in ("hdr", "exr") or (kind == "tiff" and _tiff_fields(data).get(_SAMPLE_FORMAT) == _FLOATS)
+
+
+def is_map(data: Data) -> bool:
+    """Return whether an image is a map of a quantity, such as ranges: a TIFF of one float, an EXR without R, G, B."""
+    if image_kind(data) == "tiff":
+        return holds_floats(data) and _tiff_fields(data).get(_SAMPLES, 1) == 1
+    try:
+        return image_kind(data) == "exr" and not {b"R", b"G", b"B"} <= _exr_channels(data)
+    except _DAMAGE:
+        return False
+
+
+def has_alpha(data: Data) -> bool:
+    """Return whether a PNG, WebP or TIFF file states how opaque its pixels are."""
+    try:
+        match image_kind(data):
+            case "png":
+                is_before_pixels = data.find(b"tRNS", 0, data.find(b"IDAT")) > 0  # of a palette, or of one colour
+                return data[25] in (4, 6) or is_before_pixels
+            case "webp":
+                kind, start, _ = next(riff_chunks(data))
+                return bool(data[start if kind == b"VP8X" else start + 4] & 16) and kind != b"VP8 "
+            case "tiff":
+                fields = _tiff_fields(data)
+                missing = _ALPHAS[1] if fields.get(_SAMPLES) == 4 else 0  # OpenCV writes RGBA without the field
+                return fields.get(_EXTRA_SAMPLES, missing) in _ALPHAS and fields.get(_COLORS) != _CMYK
+    except (StopIteration, *_DAMAGE):
+        pass
+    return False
+
+
+def _tiff_fields(data: Data) -> dict[int, int]:
+    """Return the first number of each integer field of the first directory of a TIFF."""
+    tiff = open_tiff(data)
+    try:
+        entries = {} if tiff is None else tiff.directory(tiff.first)
+        return {tag: value for tag in entries if tiff and (value := tiff.integer(entries[tag])) is not None}
+    except _DAMAGE:
+        return {}
 
 
 JPEG_START = b"\xff\xd8"
@@ -198,7 +313,7 @@ class Entry(NamedTuple):
 class Tiff:
     """A TIFF in memory."""
 
-    data: bytes
+    data: Data
     order: str  # "<" or ">"
     first: int  # offset of its first directory
     is_big: bool  # whether it is a BigTIFF
@@ -237,7 +352,7 @@ class Tiff:
         return tuple(above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True))
 
 
-def open_tiff(data: bytes) -> Tiff | None:
+def open_tiff(data: Data) -> Tiff | None:
     """Return the TIFF, or None if the data do not begin with a TIFF header."""
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or len(data) < 16:

@@ -90,6 +90,9 @@ def _inner(count: int, whole: int, *, first: int, length: int) -> slice:
     return slice(-(-first * count // whole), (first + length) * count // whole)
 
 
+MEANING_OF_MASKS = (
+    "0 (black) in a mask means ignored, any other value used: if yours show in white what to ignore, invert them"
+)
 _JPEG_START = b"\xff\xd8"
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PanoMvsError, StoreError
+from pano_mvs.core.kernel_cache import must_compile
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
@@ -177,7 +178,7 @@ def forecast_run(run: Run) -> Forecast | None:
         return None  # the run reports the error
     experience = Experience(run.listing.size(), (run.store.unit_times, reference_times()), run.executor.threads)
     stages = forecast(plans, run.workflow, run.graph, experience=experience)
-    return Forecast(stages, expected_report_s(stages, experience))
+    return Forecast(stages, expected_report_s(stages, experience), must_compile())
 
 
 def expected_report_s(stages: Sequence[StageForecast], experience: Experience) -> float:

@@ -56,6 +56,7 @@ class Forecast:
     kind: ClassVar[str] = "forecast"
     stages: tuple[StageForecast, ...]  # in the order of the workflow
     report_s: float = 0.0  # seconds for the report, after the last stage
+    compiles: bool = False  # whether no kernel has been compiled yet, which takes time that is in none of these
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +69,10 @@ class TimeLeft:
 
     kind: ClassVar[str] = "time_left"
     seconds_left: float  # until the run ends
-    at_least: bool = False  # whether this is a lower bound, because nothing is known of some stages yet
+    at_least: bool = False  # whether this is a lower bound, because of one of the last two
     done: float = 0.0  # share of the work that is done, 0 to 1
     unknown: tuple[str, ...] = ()  # the stages of which nothing is known
+    compiles: bool = False  # whether stages are still to come whose kernels may have to be compiled
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,8 +62,8 @@ def overrides_from_settings(settings: Mapping[str, object]) -> list[str]:
     ['images.nadir_deg=30', 'depth.cost=census', 'views=null']
 
     Args:
-        settings: `STAGE.PARAM` to its value: a string is taken as YAML, as on the command line; other values may be
-            numbers, booleans, None, paths, and lists and mappings of these.
+        settings: `STAGE.PARAM` to its value: a string is taken as on the command line, as a path if the setting is one,
+            else as YAML; other values may be numbers, booleans, None, paths, and lists and mappings of these.
 
     Raises:
         UsageError: if a value is of another type.
@@ -72,8 +72,10 @@ def overrides_from_settings(settings: Mapping[str, object]) -> list[str]:
 
 
 def _yaml(name: str, value: object) -> str:
-    if isinstance(value, str):
-        return value
+    if isinstance(value, str | PurePath):
+        return str(value)
+    if value is None and "." in name:
+        return ""  # null would be the name of a file
     try:
         return json.dumps(value, ensure_ascii=False, default=_plain)
     except (TypeError, ValueError) as error:

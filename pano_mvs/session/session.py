@@ -17,7 +17,7 @@ from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
-from pano_mvs.io.images.captures import VIDEO_SUFFIXES
+from pano_mvs.io.images.captures import UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES, unstitched_reason
 from pano_mvs.io.images.tours import is_tour
 from pano_mvs.results.summary import CACHE_VARIABLE, RunSummary, cache_of
 
@@ -51,6 +51,8 @@ def _images_mistake(images: Path) -> str:
     if not exists(images):
         denied = f"cannot be read ({problem_of(images)})" if is_denied(images) else "there is no such folder or video"
         return f"--images {images}: {denied}"
+    if images.suffix.lower() in UNSTITCHED_SUFFIXES:
+        return f"--images {images}: this is {unstitched_reason(images)}"
     if images.suffix.lower() not in VIDEO_SUFFIXES:
         return f"--images {images}: this is a file; give the folder that contains the images, or a video"
     return ""
@@ -213,7 +215,9 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
     # A relative folder is relative to where the run was started; the settings contain the absolute path.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
     given = [
-        f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
+        f"images.path={folder if isinstance(folder, str) else json.dumps(folder)}"
+        if one.startswith("images.path=") and folder
+        else one
         for one in summary.workflow.overrides
     ]
     if cache is None and summary.cache:

@@ -6,7 +6,9 @@
 
 The estimate starts from the forecast of the run (`Forecast`), which comes from earlier runs, and moves to what the
 units of each stage take in this one. A stage that nobody has experience with counts as soon as one of its units is
-being computed; until then the estimate is a lower bound.
+being computed; until then the estimate is a lower bound. So it is while kernels are to be compiled, which takes a time
+that no run knows beforehand: until each stage has computed a unit, if none was compiled before the run, or one is
+during it.
 """
 
 from __future__ import annotations
@@ -130,6 +132,7 @@ class TimeEstimator:
         self._report_s = 0.0
         self._latest_end = 0.0
         self._is_over = False
+        self._compiles = False
 
     @property
     def is_reporting(self) -> bool:
@@ -152,12 +155,15 @@ class TimeEstimator:
                 self._workers = max(1, event.workers)
                 self.stages = {name: StageProgress(StageForecast(name)) for name in event.stages}
             case Forecast():
-                self._report_s = event.report_s
+                self._report_s, self._compiles = event.report_s, event.compiles
                 for forecast in event.stages:
                     self._of(forecast.stage).forecast = forecast
+                # A run that is limited, such as by `--until`, has a forecast of its own stages alone.
+                self.stages = {forecast.stage: self.stages[forecast.stage] for forecast in event.stages}
             case WorkersChanged():
                 self._workers = max(1, event.workers)
             case KernelsCompiled():
+                self._compiles = True
                 for stage in self.stages.values():
                     stage.wait(event.seconds, self._clock())
             case StageStarted():
@@ -203,7 +209,10 @@ class TimeEstimator:
         so_far_s = now - self._latest_end if self.is_reporting else 0.0
         report = max(self._report_s - so_far_s, (_OVERDUE - 1) * so_far_s), so_far_s
         self._most_done = max(self._most_done, _share([*known.values(), report], len(unknown)))
-        return TimeLeft(left_s + report[0], at_least=bool(unknown), done=self._most_done, unknown=unknown)
+        compiles = self._compiles and any(
+            not stage.computed and stage.units_left() != 0 for stage in self.stages.values()
+        )
+        return TimeLeft(left_s + report[0], bool(unknown) or compiles, self._most_done, unknown, compiles)
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))

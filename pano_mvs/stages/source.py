@@ -27,6 +27,7 @@ from pano_mvs.api import (
     is_only_planned,
     source,
 )
+from pano_mvs.core.arrays import Mask
 from pano_mvs.core.paths import is_folder
 from pano_mvs.io.images.captures import describe_picture, list_pictures
 from pano_mvs.io.images.copies import find_copies
@@ -35,14 +36,17 @@ from pano_mvs.io.images.names import find_mask, printable_name, require_masks
 from pano_mvs.io.images.tour_configurations import FACES
 from pano_mvs.io.images.tours import TourScene, list_scenes
 from pano_mvs.scene.image_file import (
+    ALPHA_BYTES_PER_PIXEL,
     MASK_BYTES_PER_PIXEL,
     MAX_PIXELS,
     decode_image,
+    decode_opacity,
     decoding_bytes_per_pixel,
     readable_pixels,
     write_png,
 )
-from pano_mvs.scene.image_header import stated_size
+from pano_mvs.scene.image_header import has_alpha, of_file, stated_size
+from pano_mvs.scene.masking import MEANING_OF_MASKS
 from pano_mvs.scene.stereo import StereoLayout, StereoSetting, one_eye, stereo_layout
 
 STEREO: Any = Field(
@@ -118,7 +122,8 @@ def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
     item: SourceItem = inputs["item"]
     image = item.files["image"]
     masked = MASK_BYTES_PER_PIXEL if "mask" in item.files else 0
-    return readable_pixels(image, params.max_pixels) * max(decoding_bytes_per_pixel(image), masked)
+    alpha = ALPHA_BYTES_PER_PIXEL if of_file(image, has_alpha) else 0
+    return readable_pixels(image, params.max_pixels) * max(decoding_bytes_per_pixel(image), masked, alpha)
 
 
 @source("source.folder", list_items=list_folder, memory=folder_memory_bytes)
@@ -127,8 +132,8 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
 
     An image is a panorama if its GPano metadata say so (full or cropped), or if it is twice as wide as high. Masks are
     searched as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover the
-    same part of the sphere as the image, or the full sphere, at any resolution. Of stereo panoramas, the left eye is
-    used.
+    same part of the sphere as the image, or the full sphere, at any resolution. Transparent pixels of an image are
+    masked too. Of stereo panoramas, the left eye is used.
     """
     image = item.file("image")
     path, data = image.path, image.read_bytes()
@@ -147,6 +152,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"{{count}} images have {trait}")
+    opaque = decode_opacity(path, data, max_pixels=params.max_pixels)
     picture = decode_image(path, data, max_pixels=params.max_pixels)
     height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
@@ -172,16 +178,41 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         heading_deg=info.gpano.heading_deg if info.gpano else None,
         position_lla=info.position_lla,
     )
-    valid = panorama.load_mask().mean()
-    ctx.metric("valid", float(valid))
-    if not valid:
-        ctx.note(f"{item.name}: everything in it is masked")
+    return masked_panorama(panorama, opaque, name=item.name, ctx=ctx)
+
+
+def masked_panorama(panorama: Panorama, opaque: Mask | None, *, name: str, ctx: Context) -> Panorama:
+    """Return a panorama whose transparent pixels are masked too, and report how much of it is masked.
+
+    Args:
+        opaque: (h, w) bool, False where its image is transparent; None if it is opaque.
+    """
+    if opaque is not None and opaque.any():
+        ctx.note("{count} images have transparent pixels, which are ignored like masked ones")
+        panorama = panorama.with_mask(opaque, ctx.scratch)
+    elif opaque is not None:
+        ctx.note(f"{name}: all of it is transparent, so its alpha channel was not used as a mask")
+    valid = panorama.load_mask()
+    ctx.metric("valid", float(valid.mean()))
+    if not valid.any():
+        ctx.note(f"{name}: everything in it is masked")
+    if panorama.mask_file is not None:
+        shown = replace(panorama, mask_file=None).load_mask()
+        height = panorama.size_hw[0]
+        areas = np.sin((np.arange(height) + 0.5) * np.pi / height)  # of the pixels of each row
+        masked = float(areas @ (shown & ~valid).sum(axis=1) / max(areas @ shown.sum(axis=1), 1e-9))
+        ctx.metric("masked", masked)
+        if masked > 0.5:
+            ctx.note(f"{{count}} images have masks that hide most of what they show. {MEANING_OF_MASKS}")
     return panorama
 
 
 def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: FolderParams, ctx: Context) -> Panorama:
     """Store the picture of one eye without loss, and return it."""
     path = item.files["image"]
+    opaque = decode_opacity(path, data, max_pixels=params.max_pixels)
+    if opaque is not None:
+        opaque = one_eye(opaque.astype(np.uint8) * np.uint8(255), layout) == 255
     eye = one_eye(decode_image(path, data, max_pixels=params.max_pixels), layout)
     ctx.note(stereo_note("{count} images", layout))
     kept = ctx.scratch / "eye.png"
@@ -200,8 +231,7 @@ def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: Fo
         heading_deg=gpano.heading_deg if gpano else None,
         position_lla=position_from_exif(container.exif),
     )
-    ctx.metric("valid", float(panorama.load_mask().mean()))
-    return panorama
+    return masked_panorama(panorama, opaque, name=item.name, ctx=ctx)
 
 
 def stereo_note(what: str, layout: StereoLayout) -> str:

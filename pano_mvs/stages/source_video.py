@@ -22,11 +22,19 @@ from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import plural
 from pano_mvs.io.images.names import printable_name
-from pano_mvs.io.images.video import KeptFile, VideoInfo, describe_video, frames_between, list_videos, read_times
+from pano_mvs.io.images.video import (
+    KeptFile,
+    VideoInfo,
+    describe_video,
+    frame_on_display,
+    frames_between,
+    list_videos,
+    read_times,
+)
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.stereo import StereoSetting
-from pano_mvs.stages.source import STEREO, stereo_note, working_size
+from pano_mvs.stages.source import STEREO, masked_panorama, stereo_note, working_size
 
 # Motion is measured in at most this number of frames per second.
 _MEASURED_PER_S = 15.0
@@ -143,7 +151,10 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         ctx.note(f"{path.name} has a rotation in its metadata, which was ignored: frames are used as stored")
     match = _TIME_IN_NAME.fullmatch(item.name)
     assert match is not None, item.name
-    time_s, quality, frame = _best_frame(path, int(match[1]) / 1000, params, info=info, threads=ctx.threads)
+    wanted_s = int(match[1]) / 1000
+    time_s, quality, frame = _best_frame(path, wanted_s, params, info=info, threads=ctx.threads)
+    if time_s < wanted_s - params.reach_s(info) - 0.001:
+        ctx.note("{count} frames are those that a player shows at their time: the frame rate of the video varies")
     if is_dual_fisheye(frame):
         raise InputError(_dual_fisheye(path))
     ctx.metric("time_s", time_s)
@@ -158,8 +169,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
     )
-    ctx.metric("valid", float(panorama.load_mask().mean()))
-    return panorama
+    return masked_panorama(panorama, None, name=item.name, ctx=ctx)
 
 
 def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:
@@ -265,10 +275,12 @@ def _best_frame(
         badness = -quality if params.pick == "sharpest" else abs(found_s - time_s)
         if best is None or badness < least:
             best, least = (found_s, quality, frame), badness
+    if best is None and (shown := frame_on_display(path, time_s, threads=threads, stereo=info.stereo)) is not None:
+        best = (shown[0], sharpness(shown[1]), shown[1])
     if best is None:
         raise InputError(
-            f"{path}: no frame between {max(0.0, time_s - reach_s):.3f} s and {time_s + reach_s:.3f} s can be decoded: "
-            "the video is damaged there, ends early, or pauses. Set end_s or start_s, or copy it again"
+            f"{path}: no frame from {max(0.0, time_s - reach_s):.3f} s on can be decoded: the video ends before its "
+            "header says, or is damaged there. Set end_s or start_s, or copy it again"
         )
     return best
 

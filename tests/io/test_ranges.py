@@ -18,15 +18,14 @@ from pydantic import ValidationError
 from pano_mvs.api import Context, RangeMap, UsageError
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.ranges import (
-    read_exr,
     read_normals,
     read_npy,
     read_npz,
-    write_exr,
     write_normals_png,
     write_normals_tiff,
     write_range_png,
 )
+from pano_mvs.scene.exr import read_exr, write_exr
 from pano_mvs.stages.exports.files import RangesParams, ranges
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.stored import read_picture

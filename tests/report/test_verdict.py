@@ -59,6 +59,19 @@ def test_a_good_run_is_called_good_and_nothing_is_found() -> None:
     assert (found.mood, found.judgement, found.findings) == ("good", "The result looks reliable.", ())
 
 
+@pytest.mark.parametrize(("masked", "stopped", "mood"), [(0.4, "", None), (0.78, "", "fair"), (0.78, "no two", "bad")])
+def test_masks_that_hide_most_are_found_before_all_else(masked: float, stopped: str, mood: str | None) -> None:
+    """Masks whose white was meant to hide led to the advice to take panoramas closer together."""
+    stages = [{"name": "images", "run": 10, "metrics": {"masked": masked}}]
+    found = found_in(GOOD | {"stages": stages, "stopped": stopped, "poses": rejecting(30)})
+    of_masks = [finding for finding in found if "hide 78 % of what the images show" in finding.text]
+    assert [finding.mood for finding in of_masks] == ([mood] if mood else [])
+    rejected = next(finding for finding in found if "30 of 40" in finding.text)
+    assert ("more panoramas" in rejected.remedy) == (mood is None)
+    assert all("invert them" in finding.remedy for finding in of_masks)
+    assert mood != "bad" or found[0] in of_masks
+
+
 def rejecting(count: int) -> dict[str, Any]:
     reasons = {f"x{number}.png": f"{number} matches, 20 needed" for number in range(count)}
     return POSES | {"rejected": reasons}

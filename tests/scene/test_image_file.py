@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import sys
 import tracemalloc
 from pathlib import Path
@@ -14,7 +15,9 @@ import pytest
 from PIL import Image
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.exr import write_exr
+from pano_mvs.scene.image_file import decode_image, decode_opacity
+from pano_mvs.scene.image_header import has_alpha, holds_floats, is_map, of_file, stated_size
 from tests.io.images.pictures import app1, by_pillow, exif
 
 SIZE = (32, 64)
@@ -69,13 +72,126 @@ def test_eight_bits_written_as_sixteen_come_back(tmp_path: Path, factor: int, su
     np.testing.assert_array_equal(decode_image(path), levels)
 
 
-def test_a_float_picture_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    (tmp_path / "a.tif").write_bytes(bytes(cv2.imencode(".tif", np.zeros((8, 16, 3), np.float32))[1]))
-    with pytest.raises(InputError, match=r"a\.tif: float32 images are not supported\. Convert it to 8 or 16 bits"):
-        decode_image(tmp_path / "a.tif")
+def hdr_files(linear: np.ndarray, folder: Path) -> list[Path]:
+    """Write linear colours, (H, W, 3) RGB, in each format of floats."""
+    paths = [folder / name for name in ("a.hdr", "a.tif", "a.exr")]
+    for path in paths[:2]:
+        path.write_bytes(bytes(cv2.imencode(path.suffix, np.ascontiguousarray(linear[..., ::-1]))[1]))
+    write_exr(paths[2], {name: np.ascontiguousarray(linear[..., idx]) for idx, name in enumerate("RGB")})
+    return paths
+
+
+@pytest.mark.parametrize("brightness", [1e-4, 1.0, 1e6])
+def test_hdr_pictures_are_tone_mapped_whatever_their_brightness(tmp_path: Path, brightness: float) -> None:
+    """They were skipped without a word, and floating-point TIFF files were refused."""
+    levels = brightness * np.linspace(0.05, 4.0, SIZE[1])
+    linear = np.broadcast_to(np.outer(levels, [1.2, 1.0, 0.8]), (*SIZE, 3)).astype(np.float32)
+    for path in hdr_files(linear, tmp_path):
+        decoded = decode_image(path)
+        assert decoded.dtype == np.uint8
+        assert decoded.shape == (*SIZE, 3)
+        assert decoded[0, 0, 0] > decoded[0, 0, 1] > decoded[0, 0, 2] > 10, "red is first"
+        assert (np.diff(decoded[0].astype(int), axis=0) >= 0).all()
+        assert 130 < decoded[0, -1, 1] < 255, "the brightest does not clip"
+        assert has_alpha(path.read_bytes()) is is_map(path.read_bytes()) is False
+        assert holds_floats(path.read_bytes())
+        assert stated_size(path.read_bytes()) == SIZE
+
+
+def test_values_that_no_colour_has_do_not_spoil_an_hdr_picture(tmp_path: Path) -> None:
+    linear = np.full((*SIZE, 3), 0.5, np.float32)
+    linear[0, :4] = np.array([np.nan, np.inf, -np.inf, -1])[:, None]
+    for path in hdr_files(linear, tmp_path)[1:]:  # Radiance files cannot hold them
+        decoded = decode_image(path)
+        assert decoded[0, :4, 0].tolist() == [0, 255, 0, 0]
+        assert np.ptp(decoded[1:]) == 0
+        assert 100 < decoded[1, 0, 0] < 130, "middle grey"
+    (black,) = {decode_image(path).max() for path in hdr_files(0 * linear[1:], tmp_path)}
+    assert black == 0
+
+
+def test_floats_without_colours_are_refused_with_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "b.tif").write_bytes(by_pillow(SIZE, "TIFF", mode="F"))
     with pytest.raises(InputError, match=r"b\.tif: .*convert it to JPEG, or to PNG or TIFF of 8 or 16 bits"):
         decode_image(tmp_path / "b.tif")
+    write_exr(tmp_path / "c.exr", {"Z": np.ones(SIZE, np.float32)})
+    with pytest.raises(InputError, match=r"c\.exr: has no channels R, G and B, but Z\. Export its colours"):
+        decode_image(tmp_path / "c.exr")
+    assert is_map((tmp_path / "b.tif").read_bytes())
+    assert of_file(tmp_path / "c.exr", is_map)
+
+
+def test_exr_files_that_cannot_be_read_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = hdr_files(np.ones((*SIZE, 3), np.float32), tmp_path)[2]
+    data = path.read_bytes()
+    at = data.index(b"displayWindow\0box2i\0") + 24
+    path.write_bytes(data[:at] + struct.pack("<4i", 0, 0, 99, 49) + data[at + 16 :])
+    with pytest.raises(InputError, match=r"a\.exr: stores only the part \(0, 0, 63, 31\) of its picture .*Export all"):
+        decode_image(path)
+    for damaged in (data[: len(data) // 2], data[:60]):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a\.exr: not a readable EXR file"):
+            decode_image(path)
+        assert stated_size(data[:60]) is None
+        assert not is_map(data[:60])
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"a\.exr: .*pip install 'pano-mvs\[exr\]', or convert it to JPEG"):
+        decode_image(path)
+
+
+def with_alpha(mode: str = "RGBA", kind: str = "PNG", *, alpha: int = 0, **more: object) -> bytes:
+    """A picture whose first five rows have an alpha, and whose sixth is hardly opaque."""
+    pixels = np.dstack([SMOOTH, np.full(SIZE, 255, np.uint8)])
+    pixels[:5, :, 3], pixels[5, :, 3] = alpha, max(alpha, 1)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).convert(mode).save(stream, kind, **more)
+    return stream.getvalue()
+
+
+SIXTEEN = np.dstack([SMOOTH, np.full(SIZE, 255, np.uint8)]).astype(np.uint16) * np.uint16(257)
+SIXTEEN[:5, :, 3] = 0
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        with_alpha(),
+        with_alpha("LA"),
+        with_alpha(kind="WEBP"),
+        with_alpha(kind="WEBP", lossless=True),
+        with_alpha(kind="TIFF"),
+        with_alpha(kind="TIFF", compression="tiff_lzw"),
+        bytes(cv2.imencode(".png", SIXTEEN)[1]),
+        bytes(cv2.imencode(".tif", SIXTEEN)[1]),
+    ],
+)
+def test_transparent_pixels_are_known_in_every_container(data: bytes) -> None:
+    opaque = decode_opacity(Path("a"), data)
+    assert opaque is not None
+    assert np.flatnonzero(~opaque.any(axis=1)).tolist() == [0, 1, 2, 3, 4]
+    assert opaque[5:].all()
+
+
+def test_a_colour_of_a_palette_may_be_transparent() -> None:
+    stream = io.BytesIO()
+    Image.fromarray(np.arange(256, dtype=np.uint8).reshape(8, 32)).convert("P").save(stream, "PNG", transparency=3)
+    opaque = decode_opacity(Path("a"), stream.getvalue())
+    assert opaque is not None
+    assert np.argwhere(~opaque).tolist() == [[0, 3]]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(saved(kind) for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
+        saved("TIFF", "CMYK"),
+        *(with_alpha(kind=kind, alpha=255, lossless=True) for kind in ("PNG", "WEBP", "TIFF")),
+        with_alpha()[:20],
+        b"RIFF    WEBP",
+    ],
+)
+def test_pictures_without_transparent_pixels_have_no_mask(data: bytes) -> None:
+    assert decode_opacity(Path("a"), data) is None
 
 
 def test_orientation_does_not_turn_the_pixels(tmp_path: Path) -> None:

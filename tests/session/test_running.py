@@ -121,10 +121,10 @@ def test_settings_are_python_values_or_strings_as_on_the_command_line(toy: Toy) 
     assert stages["scaled"].params == {"by": 4.0}
     assert "all" not in stages
     assert output.summary.workflow.overrides[0] == "scaled.by=4"
-    assert overrides_from_settings({"a.b": "[1, 2]", "a.c": True, "a.d": [0.5, None]}) == [
-        "a.b=[1, 2]",
-        "a.c=true",
-        "a.d=[0.5, null]",
+    plain = {"a.b": "[1, 2]", "a.c": True, "a.d": [0.5, None], "a.e": Path("a #1"), "a.f": None, "a": None}
+    assert overrides_from_settings(plain) == [
+        *("a.b=[1, 2]", "a.c=true", "a.d=[0.5, null]"),
+        *("a.e=a #1", "a.f=", "a=null"),
     ]
     with pytest.raises(pano_mvs.UsageError, match=r"setting a\.b: object is not a value"):
         overrides_from_settings({"a.b": object()})

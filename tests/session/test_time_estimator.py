@@ -201,6 +201,33 @@ def test_compiling_kernels_does_not_make_a_stage_slow() -> None:
     assert run.left(4.0).seconds_left == pytest.approx(36.0)
 
 
+def test_stages_that_a_limited_run_does_not_have_are_not_waited_for() -> None:
+    """With `--until`, the time left stayed a lower bound, as nothing was known of the stages after it."""
+    run = SimulatedRun(stage("a", 1, 4.0), stage("b", 1, None, "a"), forecast=False)
+    run.estimator(Forecast((stage("a", 1, 4.0),), report_s=2.0))
+    assert run.left() == TimeLeft(6.0, at_least=False, done=0.0)
+    run.end("a")
+    assert run.estimator.is_reporting
+
+
+@pytest.mark.parametrize("known_before", [True, False])
+def test_while_kernels_are_to_be_compiled_the_estimate_is_a_lower_bound(known_before: bool) -> None:
+    """With no kernel compiled yet, the progress said "about 8 s left" for 138 s."""
+    stages = stage("a", 2, 4.0), stage("b", 1, 4.0, "a"), stage("c", 0, 4.0, "b")
+    run = SimulatedRun(*stages, forecast=False)
+    run.estimator(Forecast(stages, compiles=known_before))
+    if not known_before:  # some kernels are there, but not all
+        assert not run.left().at_least
+        run.estimator(KernelsCompiled(1, seconds=1.0))
+    assert (run.left().at_least, run.left().compiles, run.left().unknown) == (True, True, ())
+    run.start("a", "1", units=2)
+    run.finish("a", "1", seconds=4.0)
+    assert run.left().compiles, "b has kernels of its own"
+    run.start("b", "", units=1)
+    run.finish("b", "", seconds=4.0)
+    assert (run.left().at_least, run.left().compiles) == (False, False)
+
+
 def test_unknown_stages_weigh_like_the_others_in_the_bar() -> None:
     run = SimulatedRun(stage("a", 1, 10.0), stage("b", None, None, "a"))
     run.start("a", "", units=1)

@@ -16,9 +16,11 @@ import pytest
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import Context, Pose, Poses, RangeMap
 from pano_mvs.geometry import Rigid3, ray_from_pixel, ray_grid, rotate_panorama, rotation_from_rotvec
+from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.metadata import find_gpano, read_container
 from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.stages.exports.tour import PanoramasParams, TourExportParams, panoramas, tour_of_panoramas
+from pano_mvs.stages.source import FolderParams, list_folder
 from pano_mvs.testing.room import default_room, range_along, render
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.stored import read_picture
@@ -81,6 +83,21 @@ def test_the_metadata_is_read_by_others_and_by_us(tmp_path: Path, form: str) -> 
     assert gpano.up_in_cam == pytest.approx((0, -1, 0))
     ahead = poses_of().rotations[0, 2]
     assert gpano.heading_deg == pytest.approx(np.rad2deg(np.arctan2(ahead[0], ahead[2])) % 360, abs=1e-3)
+
+
+def test_the_written_folder_is_a_capture(tmp_path: Path) -> None:
+    """Its maps of ranges, which are TIFF files, failed as images."""
+    folder = tmp_path / "written"
+    for idx, form in enumerate(("jpg", "png")):
+        for target, path in exported(tmp_path / form, poses_of(), idx, format=form).files.items():
+            place = folder / target.format(item=f"hall {idx}")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(path.read_bytes())
+    items = list(list_folder(FolderParams(path=folder / "panoramas")))
+    assert [(item.name, item.problem) for item in items] == [("hall 0.jpg", ""), ("hall 1.png", "")]
+    assert any("ranges" in note and "are skipped: hall 0.tiff, hall 1.tiff" in note for note in items[0].notes)
+    info = describe_picture(items[0].files["image"])
+    assert (info.size_hw, info.warnings, info.traits) == (SIZE_HW, (), ())
 
 
 def test_what_is_not_known_is_not_stated(tmp_path: Path) -> None:

@@ -173,3 +173,37 @@ def test_any_resolution_will_do_and_all_that_is_masked_is_told(capture: Path) ->
     assert not any("masked" in note for note in notes)
     _, notes = read_folder(capture / "photos", mask=write_mask(shared, masked=slice(0, 16)))
     assert "3.png: everything in it is masked" in notes
+
+
+def test_transparent_pixels_are_masked(capture: Path) -> None:
+    """Pixels that an editor had made transparent were used with the colours that they hold."""
+    for name, alphas in {"3.png": (0, 255), "a/2.png": (255, 255), "a/1.jpg.png": (0, 0)}.items():
+        picture = np.dstack([read_picture(capture / "photos" / name), np.full((16, 32), alphas[1], np.uint8)])
+        picture[:5, :, 3] = alphas[0]
+        cv2.imwrite(str(capture / "photos" / name), picture)
+    found, notes = read_folder(capture / "photos")
+    assert {name: masked_rows(panorama) for name, panorama in found.items()} == dict(zip(NAMES, (0, 0, 5), strict=True))
+    assert "{count} images have transparent pixels, which are ignored like masked ones" in notes
+    assert "a/1.jpg.png: all of it is transparent, so its alpha channel was not used as a mask" in notes
+    write_mask(capture / "masks" / "3.png", masked=slice(4, 7))
+    found, _ = read_folder(capture / "photos", masks=capture / "masks", nadir_deg=20)
+    assert masked_rows(found["3.png"]) == 7 + 2, "both masks and the cap count"
+
+
+def test_transparent_pixels_of_a_stereo_panorama_are_those_of_the_eye_that_is_used(capture: Path) -> None:
+    picture = np.full((32, 32, 4), 255, np.uint8)
+    picture[:3, :, 3] = picture[20:, :, 3] = 0
+    cv2.imwrite(str(capture / "photos" / "3.png"), picture)
+    found, _ = read_folder(capture / "photos", stereo="top_bottom")
+    assert masked_rows(found["3.png"]) == 3
+
+
+@pytest.mark.parametrize("masked", [slice(0, 7), slice(2, 14)])
+def test_masks_that_hide_most_say_what_their_values_mean(capture: Path, masked: slice) -> None:
+    """With inverted masks, which hid 78 % of the sphere, the advice was to take panoramas closer together."""
+    write_mask(capture / "masks" / "3.png", masked=masked)
+    _, notes = read_folder(capture / "photos", masks=capture / "masks")
+    warned = [
+        note for note in notes if "masks that hide most of what they show. 0 (black) in a mask means ignored" in note
+    ]
+    assert len(warned) == (masked.start > 0)

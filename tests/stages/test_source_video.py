@@ -130,9 +130,27 @@ def test_a_frame_rate_that_varies_does_no_harm(tmp_path: Path) -> None:
         found = [number_of(frame) for _, frame in frames_between(path, begin, begin + 0.6)]
         expected = np.flatnonzero((times >= begin - 0.001) & (times <= begin + 0.601))
         assert found == expected.tolist()
-    settings = params(path, start_s=float(times[30] + 1), every_s=0.5)
-    with pytest.raises(InputError, match=r"walk\.mp4: no frame between .* or pauses"):
-        taken(settings, tmp_path)
+
+
+@pytest.mark.parametrize("every_s", [0.1, 0.5])
+def test_between_two_frames_the_one_on_display_is_used(tmp_path: Path, every_s: float) -> None:
+    """Times without a frame nearby were refused: the video was said to be damaged."""
+    path = write_video(tmp_path / "walk.mp4", 60)
+    durations = np.random.default_rng(0).uniform(0.02, 0.25, 60)
+    durations[30] = 3.0  # nothing moved, so nothing was recorded
+    retimed(path, durations.tolist())
+    times = np.concatenate([[0], np.cumsum(durations)[:-1]])
+    begin_s = round(float(times[30]), 1) + 0.5
+    found = taken(params(path, pick="nearest", start_s=begin_s, end_s=begin_s + 3.1, every_s=every_s), tmp_path)
+    for idx, (number, context, _) in enumerate(found.values()):
+        wanted_s = begin_s + idx * every_s
+        shown = int(np.searchsorted(times, wanted_s + 0.001, side="right")) - 1
+        assert number == pytest.approx(shown, abs=1), "a frame nearby, or the one on display"
+        assert context.metrics["time_s"] == pytest.approx(times[number], abs=0.002)
+        assert any("the frame rate of the video varies" in note for note in context.notes) == (
+            times[number] < wanted_s - max(every_s / 4, 0.51 * durations.mean()) - 0.001
+        )
+    assert [number for number, _, _ in found.values()][:5] == [30] * 5
 
 
 def test_several_videos_and_folders_of_them(tmp_path: Path) -> None:
@@ -200,7 +218,7 @@ def test_what_is_no_panorama_must_be_stitched_first(tmp_path: Path, name: str, p
 def test_what_the_camera_records_before_stitching_is_known_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "VID_1.insv").write_bytes(b"x")
     for path in (tmp_path, tmp_path / "VID_1.insv"):
-        with pytest.raises(InputError, match=r"equirectangular video with the camera maker's program first"):
+        with pytest.raises(InputError, match=r"VID_1\.insv, which a camera .*equirectangular video"):
             list(list_frames(params(path)))
 
 
@@ -234,7 +252,7 @@ def test_a_video_that_ends_early_gives_what_it_has(tmp_path: Path) -> None:
     items = list(list_frames(params(path, every_s=0.5)))
     context = Context(np.random.default_rng(0), tmp_path)
     assert number_of(decode_image(video(items[1], params(path, every_s=0.5), context).image.path)) in range(8, 13)
-    with pytest.raises(InputError, match=r"no frame between 2\.375 s and 2\.625 s .*ends early"):
+    with pytest.raises(InputError, match=r"no frame from 2\.375 s on can be decoded.*ends before its header says"):
         video(items[5], params(path, every_s=0.5), context)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.io.ranges import has_exr
+from pano_mvs.scene.exr import has_exr
 from tools.stress import damage, faults, hostile, kills, load
 from tools.stress.captures import TOY_STAGES
 from tools.stress.world import ImpossibleHereError

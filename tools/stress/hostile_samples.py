@@ -21,8 +21,9 @@ from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_mesh, write_ply, write_ply_mesh
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
-from pano_mvs.io.ranges import has_exr, read_normals, write_exr
+from pano_mvs.io.ranges import read_normals
 from pano_mvs.scene import PointCloud
+from pano_mvs.scene.exr import has_exr, write_exr
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
 from pano_mvs.session.session import presets_folder

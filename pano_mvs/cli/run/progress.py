@@ -172,10 +172,13 @@ class ProgressDisplay:
             return self._beginning
         if self._estimator.is_reporting:
             return f"about {shown} left (writing the report)"
-        unknown = shortened_list(map(one_line, left.unknown))
-        if left.at_least and seconds < 1:
-            return f"time left not known yet: no earlier run has computed {unknown}"
-        return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
+        if not left.at_least:
+            return f"about {shown} left"
+        compiling = ["the time to compile kernels (once)"] if left.compiles else []
+        if seconds < 1 and not compiling:
+            return f"time left not known yet: no earlier run has computed {shortened_list(map(one_line, left.unknown))}"
+        unknown = shortened_list([*compiling, *map(one_line, left.unknown)])
+        return f"time left not known yet: {unknown}" if seconds < 1 else f"more than {shown} left; not known: {unknown}"
 
 
 def _count(stage: StageProgress) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -123,6 +123,18 @@ def files_of(params: Params) -> dict[str, list[Path]]:
         if any(getattr(mark, "func", None) is _resolve for mark in _marks(field.annotation, field.metadata)):
             found[name] = _paths_in(getattr(params, name))
     return found
+
+
+def takes_path(model: type[Params], name: str, text: str) -> bool:
+    """Return whether a text is meant as a path by a setting: unless it is a list or mapping, and these are allowed."""
+    field = next((one for key, one in model.model_fields.items() if name in (key, one.alias)), None)
+    if field is None:
+        return False
+    kinds = [field.annotation, *_marks(field.annotation)]
+    if Path not in kinds:
+        return False
+    brackets = {list: "[", tuple: "[", dict: "{"}
+    return not any(text.lstrip().startswith(brackets.get(get_origin(kind), "\0")) for kind in kinds)
 
 
 def _paths_in(value: Any) -> list[Path]:

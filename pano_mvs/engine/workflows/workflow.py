@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
 from pano_mvs.core.yaml_text import Located, Problems, did_you_mean, parse_yaml, report_invalid
-from pano_mvs.engine.stages.params import Params, files_of
+from pano_mvs.engine.stages.params import Params, files_of, takes_path
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest
@@ -102,11 +102,10 @@ class WorkflowReader:
         """Return the workflow, or raise WorkflowError with every error."""
         files = self._read_files(text, path)
         entries = merge_stages(files, self.problems)
-        added = apply_overrides(entries, overrides, self.problems, images=images)
         for file in files:
             self._load_plugins(file.root.value.get("plugins"))
-        for item in added:
-            self._load_plugin(item)
+        applying = _Overrides(entries, self.problems, self._load_plugin, self._params_of)
+        applying.apply(overrides, images=images)
         if not entries and not self.problems.lines:
             self.problems.add(files[-1].root.place, "no stage is left")
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
@@ -161,6 +160,12 @@ class WorkflowReader:
         except PluginError as error:
             self.problems.add(item.place, str(error))
             self._lacks_plugins = True
+
+    def _params_of(self, node: Located) -> type[Params] | None:
+        """Return the settings of a stage as a model; None if there is no such stage."""
+        use = node.value["use"].value if "use" in node.value else None
+        spec = self.registry.stages.get(use) if isinstance(use, str) else None
+        return None if spec is None else spec.params_type
 
     def _folder(self, item: Located) -> Path:
         """Return the folder that a relative path starts from: that of its file, or the current one for overrides."""
@@ -257,61 +262,105 @@ _SYNTAX = "write STAGE.PARAM=VALUE, such as depth.planes=192"
 class _Override:
     text: str
     target: str
-    value: Located
+    written: str  # the value as it was given
+
+    def as_text(self) -> Located:
+        """Return the value as it was given."""
+        return Located(self.written, 0, 0, origin=f"--set {self.target}")
+
+    def parsed(self, problems: Problems) -> Located | None:
+        """Return the value as YAML; None with problems if it is not YAML."""
+        origin = f"--set {self.target}"
+        if not self.written.strip():
+            return Located(None, 0, 0, origin=origin)
+        try:
+            return Located(parse_yaml(self.written, origin).value, 0, 0, origin=origin)
+        except WorkflowError as error:
+            problems.lines.extend(error.problems)
+            return None
 
 
-def apply_overrides(
-    stages: dict[str, Located], overrides: Sequence[str], problems: Problems, *, images: Path | None = None
-) -> list[Located]:
-    """Change stages in place, and return the plugin files to add.
+@dataclass(frozen=True, slots=True)
+class _Overrides:
+    """Applies what is set for a run to the merged entries of the stages, in place."""
 
-    Overrides that add plugins, remove a stage or change its `use` are applied first, then the folder of images, then
-    the others in the given order. So the settings of a new stage may precede its `use`.
+    stages: dict[str, Located]
+    problems: Problems
+    load_plugin: Callable[[Located], None]
+    params_of: Callable[[Located], type[Params] | None]  # an entry to the model of its settings
 
-    Args:
-        stages: the merged entries.
-        overrides: `STAGE.PARAM=VALUE`, `STAGE.PARAM.KEY=VALUE`, `STAGE=null` or `plugins=FILE`, with values in YAML.
-        images: folder that replaces the path of the stage `images`; None to keep it.
-    """
-    plugins: list[Located] = []
-    rest: list[_Override] = []
-    for override in filter(None, (_read(text, problems) for text in overrides)):
-        if override.target == "plugins":
-            value = override.value
-            items = value.value if isinstance(value.value, list) else [value]
-            plugins.extend(Located(item.value, 0, 0, origin=value.origin) for item in items)
-        elif _stage_of(override.target, stages) == override.target:
-            if override.value.value is None:
-                del stages[override.target]
+    def apply(self, overrides: Sequence[str], *, images: Path | None = None) -> None:
+        """Change the stages, and load further plugins.
+
+        Overrides that add plugins, remove a stage or change its `use` are applied first, then the folder of images,
+        then the others in the given order. So the settings of a new stage may precede its `use`.
+
+        Args:
+            overrides: `STAGE.PARAM=VALUE`, `STAGE.PARAM.KEY=VALUE`, `STAGE=null` or `plugins=FILE`, with values in
+                YAML. A setting that is a path takes the text as it stands; without text, it is unset.
+            images: folder that replaces the path of the stage `images`; None to keep it.
+        """
+        stages, problems = self.stages, self.problems
+        rest = [override for text in overrides if (override := _read(text, problems)) and not self._restages(override)]
+        if images is not None:
+            if "images" in stages:
+                _set(stages["images"], ("path",), Located(str(resolved(images)), 0, 0, origin=f"--images {images}"))
             else:
-                problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {override.target}=null removes the stage")
-        elif override.target.removeprefix(f"{_stage_of(override.target, stages)}.") == "use":
-            _replace(stages, override)
+                problems.add("--images", "this workflow has no stage called 'images'; use --set STAGE.path=DIR")
+        for override in rest:
+            self._set(override)
+
+    def _restages(self, override: _Override) -> bool:
+        """Add plugins, remove a stage or change its `use`, and return whether the override does one of these."""
+        stages, problems = self.stages, self.problems
+        stage = _stage_of(override.target, stages)
+        is_plugin, is_stage = override.target == "plugins", override.target == stage
+        if not (is_plugin or is_stage or override.target.removeprefix(f"{stage}.") == "use"):
+            return False
+        is_file = is_plugin and not override.written.strip().startswith("[")
+        value = override.as_text() if is_file else override.parsed(problems)
+        if value is None:
+            return True
+        if is_plugin:
+            for item in value.value if isinstance(value.value, list) else [value]:
+                self.load_plugin(Located(item.value, 0, 0, origin=value.origin))
+        elif not is_stage:
+            _replace(stages, stage, value)
+        elif value.value is None:
+            del stages[stage]
         else:
-            rest.append(override)
-    if images is not None:
-        if "images" in stages:
-            _set(stages["images"], ("path",), Located(str(resolved(images)), 0, 0, origin=f"--images {images}"))
+            problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {stage}=null removes the stage")
+        return True
+
+    def _set(self, override: _Override) -> None:
+        place, stage = f"--set {override.text[:80]}", _stage_of(override.target, self.stages)
+        if not stage:
+            wanted = override.target.partition(".")[0]
+            self.problems.add(place, f"no stage {wanted[:80]!r}.{did_you_mean(wanted, self.stages)}")
+            return
+        steps = tuple(override.target[len(stage) + 1 :].split("."))
+        if not all(steps):
+            self.problems.add(place, _SYNTAX)
+            return
+        model = self.params_of(self.stages[stage])
+        value: Located | None
+        if override.written and model is not None and takes_path(model, steps[0], override.written):
+            value = override.as_text()
         else:
-            problems.add("--images", "this workflow has no stage called 'images'; use --set STAGE.path=DIR")
-    for override in rest:
-        _apply(stages, override, problems)
-    return plugins
+            value = override.parsed(self.problems)
+        if value is not None and (problem := _set(self.stages[stage], steps, value)):
+            self.problems.add(place, problem)
 
 
 def _read(text: str, problems: Problems) -> _Override | None:
     target, equals, written = text.partition("=")
+    if target.endswith(" "):  # as in `images.path = photos`
+        written = written.lstrip()
     target = target.strip()
     if not (equals and target) or (target != "plugins" and "." not in target and written.strip() not in {"null", "~"}):
         problems.add(f"--set {text[:80]}", _SYNTAX)
         return None
-    origin = f"--set {target}"
-    try:
-        value = parse_yaml(written, origin) if written.strip() else Located(None, 0, 0)
-    except WorkflowError as error:
-        problems.lines.extend(error.problems)
-        return None
-    return _Override(text, target, Located(value.value, 0, 0, origin=origin))
+    return _Override(text, target, written)
 
 
 def _stage_of(target: str, stages: dict[str, Located]) -> str:
@@ -320,27 +369,13 @@ def _stage_of(target: str, stages: dict[str, Located]) -> str:
     return max(found, key=len, default="")
 
 
-def _replace(stages: dict[str, Located], override: _Override) -> None:
+def _replace(stages: dict[str, Located], name: str, use: Located) -> None:
     """Change the `use` of a stage; this drops the settings of the old stage."""
-    name = _stage_of(override.target, stages)
     node = stages[name]
-    kept = node.value if node.value["use"].value == override.value.value else {}
+    kept = node.value if node.value["use"].value == use.value else {}
     stages[name] = Located(
-        {**kept, "use": override.value}, node.line, node.column, node.key_line, node.key_column, node.origin, node.file
+        {**kept, "use": use}, node.line, node.column, node.key_line, node.key_column, node.origin, node.file
     )
-
-
-def _apply(stages: dict[str, Located], override: _Override, problems: Problems) -> None:
-    name = _stage_of(override.target, stages)
-    if not name:
-        wanted = override.target.partition(".")[0]
-        problems.add(f"--set {override.text[:80]}", f"no stage {wanted[:80]!r}.{did_you_mean(wanted, stages)}")
-        return
-    steps = tuple(override.target[len(name) + 1 :].split("."))
-    if not all(steps):
-        problems.add(f"--set {override.text[:80]}", _SYNTAX)
-    elif problem := _set(stages[name], steps, override.value):
-        problems.add(f"--set {override.text[:80]}", problem)
 
 
 def _set(node: Located, steps: tuple[str, ...], value: Located) -> str:

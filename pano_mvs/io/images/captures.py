@@ -14,13 +14,26 @@ from pano_mvs.core.files import CACHE_MARK, OUTPUT_MARK
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.core.text import shortened_list
 from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif, position_from_exif, read_container
+from pano_mvs.io.images.placement import placed
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
+from pano_mvs.scene.image_header import holds_floats, is_map, of_file
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".insp"})
+_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".insp"})
+_HEIF_SUFFIXES = frozenset({".avif", ".heic", ".heif", ".hif"})
+PICTURE_SUFFIXES = _JPEG_SUFFIXES | _HEIF_SUFFIXES | {".png", ".tif", ".tiff", ".webp", ".hdr", ".exr"}
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
-_OTHER_PICTURES = frozenset({".bmp", ".dng", ".gif", ".jp2", ".jxl", ".psd"})
+UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
+_FISHEYE_SUFFIXES = UNSTITCHED_SUFFIXES - {".360"}  # which shows the faces of a cube
+_RAW_SUFFIXES = frozenset(
+    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".gpr", ".iiq", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
+)
+_OTHER_PICTURES = _RAW_SUFFIXES | {
+    *(".bmp", ".dib", ".gif", ".j2k", ".jp2", ".jpf", ".jps", ".jpx", ".jxl", ".jxr", ".mpo", ".pam", ".pbm"),
+    *(".pcx", ".pfm", ".pgm", ".pic", ".pnm", ".ppm", ".psb", ".psd", ".ras", ".rgbe", ".tga", ".xcf"),
+}
+_MAP_SUFFIXES = frozenset({".tif", ".tiff", ".exr"})
 _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = (
     "an EXIF orientation that rotates or mirrors them, which was ignored: the pixels of a panorama are used as "
@@ -67,13 +80,26 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
     notes = [] if notes is None else notes
     files = list(files_below(folder, notes))
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
-    others = [path.name for path in files if path.suffix.lower() in _OTHER_PICTURES]
-    if others:
-        kinds = ", ".join(sorted({Path(name).suffix.lower().lstrip(".") for name in others}))
-        notes.append(f"{folder}: images of unsupported formats ({kinds}) are skipped: {shortened_list(others)}")
-    if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
+    maps = {path for path in pictures if path.suffix.lower() in _MAP_SUFFIXES and of_file(path, is_map)}
+    pictures = [path for path in pictures if path not in maps]
+    others = [path for path in files if path.suffix.lower() in _OTHER_PICTURES]
+    unstitched = [path for path in files if path.suffix.lower() in UNSTITCHED_SUFFIXES]
+    films = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+    kinds = ", ".join(sorted({path.suffix.lower().lstrip(".") for path in others}))
+    for skipped, what in (
+        (others, f"images of unsupported formats ({kinds}; convert them to JPEG or TIFF to use them)"),
+        (maps, "maps of a single quantity, such as ranges (floating-point TIFF or EXR files without colours),"),
+        (unstitched, "recordings that are not stitched yet"),
+        (films if pictures else [], "videos, which source.video reads,"),
+    ):
+        if skipped:
+            names = [path.name for path in sorted(skipped)]
+            notes.append(f"{folder}: {what} are skipped: {shortened_list(names)}")
+    if not pictures and unstitched:
+        raise InputError(f"{folder}: no images here, but {unstitched_reason(unstitched[0])}")
+    if not pictures and films:
         raise InputError(
-            f"{folder}: no images here, but the video {film.name}. Use source.video: "
+            f"{folder}: no images here, but the video {films[0].name}. Use source.video: "
             "--set images.use=source.video --set pairs.use=pairs.sequential"
         )
     if not pictures:
@@ -84,6 +110,16 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
             )
         )
     return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+
+
+def unstitched_reason(path: Path) -> str:
+    """Return why a recording of a two-lens camera cannot be used as it is, and what to do."""
+    two_lenses = path.suffix.lower() in _FISHEYE_SUFFIXES
+    rig = " Or split it into pictures of its lenses, and use source.dual_fisheye (docs/rigs.md)" if two_lenses else ""
+    return (
+        f"{path.name}, which a camera with several lenses recorded and nobody has stitched yet. Export it as an "
+        f"equirectangular video or as panoramas with the camera maker's program.{rig}"
+    )
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
@@ -116,27 +152,24 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
             f"{path}: according to its metadata, it is {gpano.projection_type}, not equirectangular. "
             "Export it as an equirectangular panorama, or remove it"
         )
-    sphere, crop = (height, width), None
-    if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
-        sphere, crop, more = _placed(path, (height, width), full_hw=gpano.full_size_hw, crop_ltwh=gpano.crop_ltwh)
-        warnings = (*warnings, *more)
-        if sphere[0] * sphere[1] > max_pixels:
-            raise InputError(
-                f"{path}: its GPano metadata say that the full sphere is {sphere[1]}×{sphere[0]} px, more than the "
-                f"limit of {max_pixels / 1e6:.0f} megapixels. Correct the metadata, or remove them"
-            )
-    elif width != 2 * height:
+    placement = placed(path, (height, width), gpano)
+    sphere = placement.sphere_hw
+    if sphere[0] * sphere[1] > max_pixels:
         raise InputError(
-            f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
-            "metadata place it on one. Remove it, export it again as a full equirectangular panorama, set `stereo` "
-            "(top_bottom, left_right) if it shows both eyes, or, if it is "
-            "cropped, write the GPano FullPano and CroppedArea fields into it"
+            f"{path}: its GPano metadata say that the full sphere is {sphere[1]}×{sphere[0]} px, more than the "
+            f"limit of {max_pixels / 1e6:.0f} megapixels. Correct the metadata, or remove them"
         )
+    if gpano is not None and not placement.knows_left:
+        gpano = gpano.turned_unknown()
     exif = container.exif
-    traits = (_TURNED,) if orientation_from_exif(exif) != 1 else ()
+    traits = (*placement.traits, *((_TURNED,) if orientation_from_exif(exif) != 1 else ()))
+    if holds_floats(data):
+        traits = (*traits, "floating-point colours (HDR), which are tone-mapped to 8 bits, each by its own brightness")
     if gpano is None:
         traits = (*traits, "no GPano metadata; taken as full spheres, since the width is twice the height")
-    return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
+    warnings = (*warnings, *placement.warnings)
+    position_lla = position_from_exif(exif)
+    return PictureInfo(sphere, (height, width), placement.crop_ltwh, gpano, warnings, traits, position_lla)
 
 
 def panorama_in(path: Path) -> Panorama:
@@ -189,34 +222,6 @@ def _is_left_out(folder: Path) -> bool:
     if name.startswith(".") or name.lower() in _IGNORED_FOLDERS:
         return True
     return exists(folder / OUTPUT_MARK) or exists(folder / CACHE_MARK)
-
-
-def _placed(
-    path: Path, size_hw: tuple[int, int], *, full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
-) -> tuple[tuple[int, int], tuple[int, int, int, int] | None, tuple[str, ...]]:
-    """Return the size of the sphere, the part in the file (None: all), and warnings."""
-    (height, width), (full_height, full_width) = size_hw, full_hw
-    left, top, crop_width, crop_height = crop_ltwh
-    warnings: tuple[str, ...] = ()
-    if (crop_height, crop_width) != size_hw:
-        if abs(width * crop_height - height * crop_width) > max(width, height, crop_width, crop_height):
-            raise InputError(
-                f"{path}: {width}×{height} px, but its GPano metadata state {crop_width}×{crop_height}. It was cut "
-                "after it was taken: restore the original, or remove the metadata"
-            )
-        warnings = (
-            f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
-            "fields count the original's pixels",
-        )
-    whole = (crop_height, crop_width) == full_hw
-    if whole:
-        full_height, full_width = size_hw
-    if full_width != 2 * full_height or left < 0 or top < 0:
-        raise InputError(
-            f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
-            "the width must be twice the height. Correct the metadata, or remove them"
-        )
-    return (full_height, full_width), None if whole else crop_ltwh, warnings
 
 
 Layout = Literal["auto", "side_by_side", "folders", "suffixes"]

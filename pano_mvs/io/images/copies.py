@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.video import KeptFile
 from pano_mvs.scene import FilePart
-from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
-from pano_mvs.scene.image_header import stated_size
+from pano_mvs.scene.image_file import MAX_PIXELS, decode_image, decode_picture
+from pano_mvs.scene.image_header import holds_floats, stated_size
 
 _SIZE_HW = (128, 256)
 # Of 512 magnitudes: such copies agree by .98 and more, other panoramas by .89 and less (rooms, a city, a flat).
@@ -131,6 +131,9 @@ def _reduced(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
 def _decoded(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
     with suppress(InputError):
         data = FilePart(path).read_bytes()
+        if holds_floats(data):
+            grey = cv2.cvtColor(decode_image(path, data, max_pixels=max_pixels), cv2.COLOR_RGB2GRAY)
+            return np.asarray(cv2.resize(grey, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA), np.uint8)
         size_hw = stated_size(data)
         width = size_hw[1] if size_hw is not None else 0
         flags = next((flag for by, flag in _REDUCED.items() if width >= by * _SIZE_HW[1]), cv2.IMREAD_GRAYSCALE)

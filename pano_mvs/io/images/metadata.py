@@ -18,7 +18,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pano_mvs.core.text import shortened, xml_root
@@ -149,6 +149,8 @@ _READERS: Mapping[ImageKind, Callable[[bytes], Container]] = {
     "webp": _read_webp,
     "tiff": _read_tiff,
     "heif": _read_heif,
+    "hdr": lambda data: Container(stated_size(data)),  # whoever searches the file finds its XMP
+    "exr": lambda data: Container(stated_size(data)),
 }
 
 
@@ -241,9 +243,10 @@ class GPano:
     """The GPano metadata of an image."""
 
     projection_type: str = "equirectangular"  # "equirectangular" or, rarely, another, in lower case
-    full_size_hw: tuple[int, int] | None = None  # (height, width) of the whole sphere in pixels, or None
-    # (left, top, width, height) of the part in the image, in the same pixels, or None
-    crop_ltwh: tuple[int, int, int, int] | None = None
+    # (height, width) of the whole sphere in pixels; None for a side that is not stated
+    full_size_hw: tuple[int | None, int | None] = (None, None)
+    # (left, top, width, height) of the part in the image, in the same pixels; None for what is not stated
+    crop_ltwh: tuple[int | None, int | None, int | None, int | None] = (None, None, None, None)
     heading_deg: float | None = None  # compass heading of the image centre, or None
     pitch_deg: float | None = None
     roll_deg: float | None = None
@@ -259,6 +262,15 @@ class GPano:
             return None
         pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)
         return -math.sin(roll), -math.cos(pitch) * math.cos(roll), math.sin(pitch) * math.cos(roll)
+
+    def turned_unknown(self) -> GPano:
+        """Return the metadata of an image of which it is unknown where on the horizon it begins.
+
+        It has no heading then, and pitch and roll, which are about axes through its middle, only if both are 0.
+        """
+        is_level = self.pitch_deg == self.roll_deg == 0
+        level_deg = 0.0 if is_level else None
+        return replace(self, heading_deg=None, pitch_deg=level_deg, roll_deg=level_deg)
 
 
 def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None, tuple[str, ...]]:
@@ -335,22 +347,19 @@ def _gpano(fields: dict[str, str], warnings: list[str]) -> GPano:
             return None
         return value
 
-    full = _pixels(number("FullPanoHeightPixels"), number("FullPanoWidthPixels"))
-    part = _pixels(number("CroppedAreaImageWidthPixels"), number("CroppedAreaImageHeightPixels"))
-    left, top = int(number("CroppedAreaLeftPixels") or 0), int(number("CroppedAreaTopPixels") or 0)
-    crop = None if part is None else (left, top, *part)
-    if full and crop and not (0 <= left <= full[1] - crop[2] and 0 <= top <= full[0] - crop[3]):
-        warnings.append(f"its GPano cropped area {crop} does not lie within {full[1]}×{full[0]} px and was ignored")
-        crop = None
+    def pixels(name: str, least: int) -> int | None:
+        value = number(name)
+        if value is not None and value < least:
+            warnings.append(f"its GPano field {name} is {fields[name]}, which no image has, and was ignored")
+            return None
+        return None if value is None else int(value)
+
+    full = pixels("FullPanoHeightPixels", 1), pixels("FullPanoWidthPixels", 1)
+    corner = pixels("CroppedAreaLeftPixels", 0), pixels("CroppedAreaTopPixels", 0)
+    size = pixels("CroppedAreaImageWidthPixels", 1), pixels("CroppedAreaImageHeightPixels", 1)
     angles = (number("PoseHeadingDegrees"), number("PosePitchDegrees"), number("PoseRollDegrees"))
     kind = shortened(fields.get("ProjectionType", "equirectangular").lower(), _MAX_SHOWN)
-    return GPano(kind, full, crop, *angles)
-
-
-def _pixels(first: float | None, second: float | None) -> tuple[int, int] | None:
-    if first is None or second is None or min(first, second) < 1:
-        return None
-    return int(first), int(second)
+    return GPano(kind, full, (*corner, *size), *angles)
 
 
 _JPEG_XMP, _GPANO_WRITER_PNG_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"XML:com.adobe.xmp"

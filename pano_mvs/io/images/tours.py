@@ -16,7 +16,14 @@ from urllib.parse import unquote
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import item_problem, plain_title
 from pano_mvs.core.text import shortened, shortened_list
-from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, files_below, natural_key
+from pano_mvs.io.images.captures import (
+    PICTURE_SUFFIXES,
+    UNSTITCHED_SUFFIXES,
+    describe_picture,
+    files_below,
+    natural_key,
+    unstitched_reason,
+)
 from pano_mvs.io.images.tour_configurations import FACES, NAMES, Grid, StatedScene, stated_scenes
 
 Tiles: TypeAlias = dict[tuple[str, int, int], Path]
@@ -70,6 +77,9 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
     complete = {name: tiles for name, levels in found.items() if (tiles := _finest(levels))}
     if incomplete := [name or folder.name for name in found if name not in complete]:
         notes.append(f"{len(incomplete)} scenes have no complete cube and are skipped: {shortened_list(incomplete)}")
+    unstitched = next((path for path in capture.files if path.suffix.lower() in UNSTITCHED_SUFFIXES), None)
+    if not complete and unstitched is not None:
+        raise InputError(f"{folder}: no tour here, but {unstitched_reason(unstitched)}")
     if not complete:
         raise InputError(
             f"{folder}: no tour here. Six faces of a cube are needed for each scene: tiles of Marzipano, Pannellum or "

@@ -23,12 +23,18 @@ from pano_mvs.core.errors import InputError, StoreError
 from pano_mvs.core.files import read_regular, replacing
 from pano_mvs.core.kernel_cache import user_cache_folder
 from pano_mvs.core.paths import is_file, is_folder, problem_of, resolved
-from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
+from pano_mvs.core.text import shortened_list
+from pano_mvs.io.images.captures import (
+    UNSTITCHED_SUFFIXES,
+    VIDEO_SUFFIXES,
+    files_below,
+    natural_key,
+    unstitched_reason,
+)
 from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye, stereo_layout
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace FFmpeg's messages
 
-_UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
 _SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
@@ -52,24 +58,26 @@ def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
         InputError: if there is no video, or only recordings that must be stitched first.
     """
     if is_file(path):
-        if path.suffix.lower() in _UNSTITCHED_SUFFIXES:
-            raise InputError(f"{path}: {path.suffix} is what the camera records before stitching; {_UNSTITCHED}")
+        if path.suffix.lower() in UNSTITCHED_SUFFIXES:
+            raise InputError(f"{path.parent}: the video is {unstitched_reason(path)}")
         return [path]
     if not is_folder(path):
         raise InputError(
             f"{path}: no such video or folder ({problem_of(path) or 'it is neither'}). Give a video, "
             "several, or the folder that holds them"
         )
-    files = list(files_below(path, [] if notes is None else notes))
+    notes = [] if notes is None else notes
+    files = list(files_below(path, notes))
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+    unstitched = [file for file in files if file.suffix.lower() in UNSTITCHED_SUFFIXES]
+    if not videos and unstitched:
+        raise InputError(f"{path}: no videos here that can be used, but {unstitched_reason(unstitched[0])}")
     if not videos:
-        raw = [file.name for file in files if file.suffix.lower() in _UNSTITCHED_SUFFIXES]
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in VIDEO_SUFFIXES))
-        raise InputError(
-            f"{path}: {raw[0]} is not stitched; {_UNSTITCHED}"
-            if raw
-            else f"{path}: no videos here; supported formats: {kinds}. For images, use source.folder"
-        )
+        raise InputError(f"{path}: no videos here; supported formats: {kinds}. For images, use source.folder")
+    if unstitched:
+        names = shortened_list([file.name for file in unstitched])
+        notes.append(f"{path}: recordings that are not stitched yet are skipped: {names}")
     return sorted(videos, key=lambda file: natural_key(file.relative_to(path).as_posix()))
 
 
@@ -165,6 +173,25 @@ def frames_between(
                 yield time_s, one_eye(frame, stereo)
             previous = time_s
             has_frame = capture.grab()
+
+
+def frame_on_display(
+    path: Path, time_s: float, *, threads: int = 1, stereo: StereoLayout = "none"
+) -> tuple[float, NDArray[np.uint8]] | None:
+    """Return the time and image of the frame that a player shows at a time between two frames, as `frames_between`.
+
+    Returns:
+        None if no later frame can be decoded: then the video is damaged, or ends before.
+    """
+    shown_s = None
+    with _opened(path, threads) as capture:
+        has_frame = _seek(capture, time_s)
+        while has_frame and (next_s := capture.get(cv2.CAP_PROP_POS_MSEC) / 1000) <= time_s + _SLACK_S:
+            shown_s = next_s
+            has_frame = capture.grab()
+    if shown_s is None or not has_frame:
+        return None
+    return next(frames_between(path, shown_s, shown_s, threads=threads, stereo=stereo), None)
 
 
 def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:

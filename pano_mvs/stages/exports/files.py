@@ -35,16 +35,14 @@ from pano_mvs.io.point_selection import Selection, select_points
 from pano_mvs.io.poses.metashape import write_metashape
 from pano_mvs.io.poses.other_json import write_openmvg
 from pano_mvs.io.ranges import (
-    EXR_REMEDY,
-    has_exr,
     write_confidence_png,
-    write_exr,
     write_normals_png,
     write_normals_tiff,
     write_range_png,
     write_range_tiff,
 )
 from pano_mvs.io.tiles_3d import TilesetWriter
+from pano_mvs.scene.exr import EXR_REMEDY, has_exr, write_exr
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import world_up, z_up_from_world

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,16 @@ def test_the_time_left_is_never_missing_and_never_stands_still() -> None:
     lines = [shown.live(10.0)[-1] for _ in range(30)]
     assert all("more than" in line and line.endswith("left; not known: cloud") for line in lines)
     assert len(set(lines)) == len(lines)
+
+
+def test_kernels_that_are_not_compiled_yet_are_no_part_of_the_time_left() -> None:
+    """A first run said "about 8 s left" for 138 s."""
+    shown = Shown(is_terminal=True)
+    shown.events(STARTED, replace(FORECAST, compiles=True), StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
+    assert shown.live(1.0)[-1].endswith("more than 3:02 left; not known: the time to compile kernels (once)")
+    short = Forecast((StageForecast("depth", (), 0, 1, 0.1, 1.0),), compiles=True)
+    shown.events(STARTED, short)
+    assert shown.live()[-1].endswith("time left not known yet: the time to compile kernels (once)")
 
 
 def test_nothing_is_left_but_the_report_once_all_stages_are_finished() -> None:

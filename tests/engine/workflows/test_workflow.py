@@ -300,7 +300,7 @@ def test_files_that_extend_two_others_each_do_not_multiply(toy: Toy) -> None:
 
 
 SETTINGS = '''
-from pano_mvs.api import InputPath, Names, One, Pairs, Params, stage
+from pano_mvs.api import InputPath, Names, One, Pairs, Params, SourcePath, stage
 from pydantic import Field
 
 
@@ -315,6 +315,7 @@ class Many(Params):
     inner: Inner = Inner()
     limit: float | None = 3
     file: InputPath | None = None
+    files: SourcePath | list[SourcePath] = []
 
 
 @stage("test.many")
@@ -375,6 +376,37 @@ def test_values_of_every_form(settings: Path, override: str, key: str, value: ob
     assert load_with(settings, override).stages["many"].params.model_dump()[key] == value
 
 
+@pytest.mark.parametrize(
+    "name", ["a #1", "20241128", "1.5", "1e3", "null", "[a", "{x}", "a: b", "'a'", "- a", "true", "!x"]
+)
+def test_a_path_takes_the_text_as_it_stands(settings: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folder `a` was used for `a #1`, and folders that YAML takes for a number or null failed or vanished."""
+    monkeypatch.chdir(settings)
+    (settings / name).mkdir()
+    found = load_with(settings, f"many.file={name}", f"many.files={name}" if name != "[a" else "many.numbers=[1]")
+    params = found.stages["many"].params.model_dump()
+    assert params["file"] == settings / name
+    assert name == "[a" or params["files"] == settings / name
+    (settings / f"{name}.py").write_text(SETTINGS.replace("test.", "extra."))
+    if not name.startswith("["):
+        assert [path.name for path in load_with(settings, f"plugins={name}.py").plugins][1:] == [f"{name}.py"]
+
+
+def test_paths_can_be_unset_and_listed(settings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(settings)
+    for name in ("a", "b"):
+        (settings / name).mkdir()
+    found = load_with(settings, "many.file=a", "many.file=", "many.files=[a, b]", "many.files.1 =  a")
+    params = found.stages["many"].params.model_dump()
+    assert (params["file"], params["files"]) == (None, [settings / "a", settings / "a"])
+    text = TEXT.replace("retries: 3", "file: 20241128")
+    with pytest.raises(
+        WorkflowError,
+        match=r"wf\.yaml:4:\d+: stage 'many': file: YAML reads this as .*put the name of a file in quotes",
+    ):
+        WorkflowReader("wf.yaml", settings, Registry()).read(text)
+
+
 def test_names_with_dots_later_ones_and_reserved_keys(settings: Path) -> None:
     found = load_with(
         settings,
@@ -418,7 +450,7 @@ def test_plugin_files_can_be_added(toy: Toy, settings: Path, monkeypatch: pytest
         assert [path.name for path in found.plugins] == ["settings.py", "extra.py"]
     gone = problems_with(settings, "plugins=gone.py")
     assert gone[0].startswith("--set plugins: plugin file")
-    assert "--set plugins: a plugin must be the path of a Python file" in problems_with(settings, "plugins=7")
+    assert "--set plugins: a plugin must be the path of a Python file" in problems_with(settings, "plugins=[7]")
 
 
 def test_paths_in_files_and_on_the_command_line(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,8 +14,13 @@ import pytest
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.io.images import captures
-from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
+from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures, natural_key
+from pano_mvs.io.images.tours import list_scenes
+from pano_mvs.io.images.video import list_videos
+from pano_mvs.io.ranges import write_range_tiff
 from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.exr import write_exr
+from pano_mvs.session.session import open_session
 from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
 from tests.permissions import permissions_hold
 
@@ -158,6 +164,79 @@ def test_a_panorama_made_smaller_keeps_its_place(tmp_path: Path) -> None:
     assert "resized from 600×300 to 60×30 px" in info.warnings[0]
 
 
+def described(folder: Path, size_hw: tuple[int, int], fields: dict[str, object]) -> PictureInfo:
+    stated = {name: value for name, value in fields.items() if value is not None}
+    return describe_picture(write_png(folder / "a.png", size_hw, xmp(stated)))
+
+
+LEFT, TOP = "CroppedAreaLeftPixels", "CroppedAreaTopPixels"
+WIDTH, HEIGHT = "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels"
+FULL_WIDTH, FULL_HEIGHT = "FullPanoWidthPixels", "FullPanoHeightPixels"
+
+
+@pytest.mark.parametrize(
+    ("size_hw", "crop_ltwh", "missing", "placed", "said"),
+    [
+        # a missing upper edge counted as 0: directions were wrong by half of what was cut off
+        ((30, 80), (0, 7, 80, 30), {TOP: None}, (0, 5, 80, 30), "no CroppedAreaTopPixels in their GPano metadata"),
+        ((30, 80), (0, 7, 80, 30), {TOP: "n/a"}, (0, 5, 80, 30), "no CroppedAreaTopPixels in their GPano metadata"),
+        ((30, 80), (0, 7, 80, 30), {TOP: -7}, (0, 5, 80, 30), "no CroppedAreaTopPixels in their GPano metadata"),
+        ((30, 60), (10, 7, 60, 30), {LEFT: None}, (10, 7, 60, 30), "no CroppedAreaLeftPixels in their GPano metadata"),
+        # what the other fields imply is known
+        ((30, 80), (0, 7, 80, 30), {LEFT: None}, (0, 7, 80, 30), ""),
+        ((40, 60), (9, 0, 60, 40), {TOP: None}, (9, 0, 60, 40), ""),
+        ((30, 60), (9, 7, 60, 30), {FULL_WIDTH: None}, (9, 7, 60, 30), ""),
+        ((30, 60), (9, 7, 60, 30), {FULL_HEIGHT: None}, (9, 7, 60, 30), ""),
+        ((15, 30), (9, 7, 60, 30), {HEIGHT: None}, (9, 7, 60, 30), "resized from 60×30"),
+        ((15, 30), (9, 7, 60, 30), {WIDTH: None}, (9, 7, 60, 30), "resized from 60×30"),
+        ((30, 60), (9, 7, 60, 30), {WIDTH: None, HEIGHT: None}, (9, 7, 60, 30), "do not state the size of the part"),
+        ((40, 80), (0, 0, 80, 40), {TOP: None, LEFT: None}, None, ""),
+        ((20, 40), (0, 0, 80, 40), {TOP: None, LEFT: None, WIDTH: None, HEIGHT: None}, None, ""),
+        ((40, 80), (3, 0, 80, 40), {}, None, "show all of the sphere"),
+        ((40, 80), (0, 0, 80, 40), {FULL_WIDTH: None, FULL_HEIGHT: None}, None, ""),
+    ],
+)
+def test_a_field_that_a_crop_does_not_state_is_not_zero(
+    tmp_path: Path,
+    size_hw: tuple[int, int],
+    crop_ltwh: tuple[int, int, int, int],
+    missing: dict[str, object],
+    placed: tuple[int, int, int, int] | None,
+    said: str,
+) -> None:
+    info = described(tmp_path, size_hw, cropped(full_sphere(40, 80), crop_ltwh) | missing)
+    assert (info.size_hw, info.crop_ltwh) == (size_hw if placed is None else (40, 80), placed)
+    notes = (*info.warnings, *info.traits)
+    assert any(said in note for note in notes) if said else not notes
+
+
+@pytest.mark.parametrize(
+    ("crop_ltwh", "missing", "what"),
+    [
+        ((10, 7, 60, 30), {TOP: None}, "60×30 px of a sphere of 80×40, but not its upper edge, CroppedAreaTopPixels"),
+        ((10, 7, 60, 30), {FULL_WIDTH: None, FULL_HEIGHT: None}, "but not the size of the full sphere"),
+        ((30, 7, 60, 30), {}, r"60×30 px at \(30, 7\) does not lie within the sphere of 80×40"),
+        ((10, 17, 60, 30), {}, r"60×30 px at \(10, 17\) does not lie within the sphere of 80×40"),
+    ],
+)
+def test_a_crop_whose_place_is_unknown_is_refused(
+    tmp_path: Path, crop_ltwh: tuple[int, int, int, int], missing: dict[str, object], what: str
+) -> None:
+    """Those that are twice as wide as high were taken for full spheres."""
+    with pytest.raises(InputError, match=rf"a\.png: .*{what}.*\. (Write|Correct) the "):
+        described(tmp_path, (30, 60), cropped(full_sphere(40, 80), crop_ltwh) | missing)
+
+
+def test_a_crop_that_may_begin_anywhere_has_neither_a_heading_nor_a_slope(tmp_path: Path) -> None:
+    fields = cropped(full_sphere(40, 80), (10, 7, 60, 30)) | {LEFT: None, "PoseHeadingDegrees": 90}
+    for pitch_deg, expected in ((0, (0, -1, 0)), (5, None)):
+        angles = {"PosePitchDegrees": pitch_deg, "PoseRollDegrees": 0}
+        gpano = described(tmp_path, (30, 60), fields | angles).gpano
+        assert gpano is not None
+        assert gpano.heading_deg is None
+        assert gpano.up_in_cam == (None if expected is None else pytest.approx(expected))
+
+
 @pytest.mark.parametrize("height", [20_000, 10**9, 10**300])
 def test_a_sphere_of_any_size_costs_no_memory(tmp_path: Path, height: int) -> None:
     """A GPano field of two thousand million columns ended the whole run without a report."""
@@ -167,12 +246,14 @@ def test_a_sphere_of_any_size_costs_no_memory(tmp_path: Path, height: int) -> No
 
 
 def test_what_is_not_a_picture_file_is_named(tmp_path: Path) -> None:
-    """Broken links, pipes, links to devices and GIFs vanished without a word."""
+    """Broken links, pipes, links to devices, GIFs, raw pictures, and recordings that are not stitched vanished."""
     write_png(tmp_path / "a.png", (32, 64))
     (tmp_path / "b.jpg").symlink_to("nowhere.jpg")
     (tmp_path / "c.jpg").symlink_to("/dev/zero")
-    (tmp_path / "e.gif").touch()
-    (tmp_path / "notes.txt").touch()
+    for name in ("e.gif", "f.DNG", "g.insv", "h.mp4", "notes.txt"):
+        (tmp_path / name).touch()
+    write_range_tiff(tmp_path / "i.tiff", np.ones((32, 64), np.float32))
+    write_exr(tmp_path / "j.exr", {"Z": np.ones((32, 64), np.float32)})
     notes: list[str] = []
     os.mkfifo(tmp_path / "d.jpg")
     assert [path.name for path in list_pictures(tmp_path, notes)] == ["a.png"]
@@ -180,8 +261,52 @@ def test_what_is_not_a_picture_file_is_named(tmp_path: Path) -> None:
         "/b.jpg: this is a link that leads nowhere; it is skipped",
         "/c.jpg: this is not a regular file; it is skipped",
         "/d.jpg: this is not a regular file; it is skipped",
-        ": images of unsupported formats (gif) are skipped: e.gif",
+        ": images of unsupported formats (dng, gif; convert them to JPEG or TIFF to use them) are skipped: "
+        "e.gif, f.DNG",
+        ": maps of a single quantity, such as ranges (floating-point TIFF or EXR files without colours), are skipped: "
+        "i.tiff, j.exr",
+        ": recordings that are not stitched yet are skipped: g.insv",
+        ": videos, which source.video reads, are skipped: h.mp4",
     ]
+
+
+@pytest.mark.parametrize("suffix", ["jfif", "jpe", "JPE", "hdr", "exr"])
+def test_pictures_are_read_whatever_their_suffix(tmp_path: Path, suffix: str) -> None:
+    """Files called .jfif, .jpe, .hdr and .exr beside others were left out without a word."""
+    path = tmp_path / f"b.{suffix}"
+    if suffix == "exr":
+        write_exr(path, dict.fromkeys("RGB", np.ones((32, 64), np.float32)))
+    else:
+        kind = ".hdr" if suffix == "hdr" else ".jpg"
+        path.write_bytes(bytes(cv2.imencode(kind, picture((32, 64)).astype(np.float32))[1]))
+    write_png(tmp_path / "a.png", (32, 64))
+    notes: list[str] = []
+    assert list_pictures(tmp_path, notes) == [tmp_path / "a.png", path]
+    assert notes == []
+    info = describe_picture(path)
+    assert info.size_hw == (32, 64)
+    assert any("tone-mapped" in trait for trait in info.traits) == (suffix in ("hdr", "exr"))
+
+
+@pytest.mark.parametrize(("name", "rig"), [("VID_1.insv", True), ("GS010001.360", False)])
+def test_recordings_that_are_not_stitched_say_so_wherever_they_are_given(tmp_path: Path, name: str, rig: bool) -> None:
+    """A folder of them had "no images here"."""
+    (tmp_path / name).touch()
+
+    def read_as_images() -> None:
+        open_session("quickstart", images=tmp_path / name, out=tmp_path / "out")
+
+    reads: list[Callable[[], object]] = [
+        lambda: list_pictures(tmp_path),
+        lambda: list_videos(tmp_path),
+        lambda: list_videos(tmp_path / name),
+        lambda: list_scenes(tmp_path, []),
+        read_as_images,
+    ]
+    for read in reads:
+        with pytest.raises(InputError, match=rf"{name}, which a camera .* recorded .*Export it as") as caught:
+            read()
+        assert ("source.dual_fisheye" in str(caught.value)) == rig
 
 
 @pytest.mark.parametrize(

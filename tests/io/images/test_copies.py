@@ -52,6 +52,13 @@ def test_copies_are_found_with_their_turn(
         assert found["c.jpg"].turn_deg == pytest.approx(360 * columns / 512, abs=1.5)
 
 
+def test_an_hdr_picture_is_a_copy_of_the_one_that_was_made_from_it(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    paths = [tmp_path / "a.jpg", tmp_path / "b.hdr"]
+    cv2.imwrite(str(paths[0]), picture)
+    cv2.imwrite(str(paths[1]), (1e3 * (picture / 255) ** 2.2).astype(np.float32))
+    assert list(find_copies({path.name: path for path in paths})) == ["b.hdr"]
+
+
 @pytest.mark.parametrize("step", [0.1, 0.3])
 def test_panoramas_side_by_side_are_no_copies(tmp_path: Path, picture: NDArray[np.uint8], step: float) -> None:
     paths = [tmp_path / "a.png", tmp_path / "b.png"]
