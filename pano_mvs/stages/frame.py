@@ -46,6 +46,8 @@ def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context
         )
         levelled.append(level_group)
         which = f"group {number}: " if len(groups) > 1 else ""
+        if vertical.unused:
+            ctx.note(f"{which}pitch and roll in the metadata were not used: {vertical.unused}")
         if not vertical:
             ctx.note(f"{which}the world was not levelled: {vertical.reason}")
         else:
