@@ -153,7 +153,7 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
 
 
 def _stopped(summary: RunSummary) -> Iterator[Finding]:
-    if summary.stopped == "interrupted":
+    if summary.exit_code == INTERRUPTED:
         yield Finding(
             "fair",
             "The run was interrupted. This report shows what it had finished.",

@@ -302,9 +302,7 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     return Poses.without_points(
         poses,
         rejected=rejected,
-        frame=model.frame,
-        scale=model.scale,
-        metric=model.metric,
+        **model.worlds[0]._asdict(),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -15,14 +14,13 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import UP, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 
 ComplexArray = NDArray[np.complex128]
 
 _MIN_POSITIONS = 3
 _MAX_HYPOTHESES = 2000
 _OUTLIER_SIGMAS = 3.0
-_GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)°, (-?[\d.]+)°, (-?[\d.]+) m\)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +123,14 @@ def georeferenced_poses(poses: Poses, fit: GpsFit) -> Poses:
         f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:z.7f}°, "
         f"{longitude:z.7f}°, {altitude:z.1f} m)"
     )
-    return replace(moved, frame=frame, scale=f"metres, by {fit.words}", metric=True)
-
-
-def origin_of_frame(frame: str) -> tuple[float, float, float] | None:
-    """Return latitude deg, longitude deg and altitude m of the origin that `georeferenced_poses` has written.
-
-    Args:
-        frame: the description of the world frame (`Poses.frame`).
-
-    Returns:
-        None if GPS did not determine the world frame.
-    """
-    found = _GEOREFERENCED.match(frame)
-    return None if found is None else (float(found[1]), float(found[2]), float(found[3]))
+    return replace(
+        moved,
+        frame=frame,
+        scale=f"metres, by {fit.words}",
+        metric=True,
+        axes=WorldAxes.NORTH,
+        origin_lla=(float(latitude), float(longitude), float(altitude)),
+    )
 
 
 def _judged(

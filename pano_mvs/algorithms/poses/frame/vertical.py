@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.poses.frame.upside_down import most_probable_up, upside_down_probability
 from pano_mvs.algorithms.poses.frame.vertical_lines import (
     Picture,
@@ -28,7 +27,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import UP, Similarity3, angle_between, rotation_from_rotvec, rotation_from_two_vectors
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 
@@ -343,7 +342,7 @@ def level_poses(
         The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned
         the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
-    if origin_of_frame(poses.frame) is not None:
+    if poses.origin_lla is not None:
         return poses, Vertical(UP, reason="GPS has already turned it: x east, y down, z north")
     vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
     if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
@@ -356,22 +355,22 @@ def level_poses(
         return poses, vertical
     levelling = rotation_from_two_vectors(vertical.up_in_world, UP)
     level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
-    towards, heading = _northward(level, heading_deg or {})
+    axes, towards, heading = _northward(level, heading_deg or {})
     # Adding 0 turns −0 into 0: the first camera is exactly at the origin.
     level = moved_poses(level, Similarity3(1.0, towards, np.zeros(3)))
     level.translations[0] = 0.0
     known = f"{vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°"
     frame = f"origin at the first registered camera; y down along gravity, by {known}; {heading}"
-    return replace(level, frame=frame), vertical
+    return replace(level, frame=frame, axes=axes), vertical
 
 
-def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArray, str]:
-    """Return the rotation about the vertical that makes z point north, and its description."""
+def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[WorldAxes, FloatArray, str]:
+    """Return the axes, the rotation about the vertical that makes z point north if it is known, and its description."""
     headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
     unturned = "z close to where it pointed before levelling"
     # Software that knows no heading writes zero for all images.
     if len(headings) < 2 or not any(heading for _, heading in headings):
-        return np.eye(3), unturned
+        return WorldAxes.LEVEL, np.eye(3), unturned
     forward = np.array([level.rotations[idx][2] for idx, _ in headings])
     measured_rad = np.deg2rad([heading for _, heading in headings])
     turns = np.exp(1j * (measured_rad - np.arctan2(forward[:, 0], forward[:, 2])))
@@ -379,7 +378,8 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     turn_rad = float(np.angle(medoid)) + float(np.median(np.angle(turns / medoid)))
     off_deg = float(np.median(np.abs(np.rad2deg(np.angle(turns * np.exp(-1j * turn_rad))))))
     if off_deg > 15.0:
-        return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
-    return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
+        return WorldAxes.LEVEL, np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
+    heading = (
         f"z north, by {len(headings)} compass {plural(len(headings), 'heading')} (median disagreement {off_deg:.1f}°)"
     )
+    return WorldAxes.NORTH, rotation_from_rotvec([0.0, turn_rad, 0.0]), heading

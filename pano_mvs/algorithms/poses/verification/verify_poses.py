@@ -80,7 +80,7 @@ def verified_group(
     fixed = () if correct and inside else range(len(poses.names))
     checks = correct_cameras(model, confirmation, fixed=fixed, miss_cost=miss_cost)
     if checks.moved or checks.removed:
-        moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
+        moved = replace(poses_of(model), **poses.worlds[0]._asdict())
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     return with_camera_checks(poses, pairs, checks)
 

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, origin_of_frame, scaled_by_gps
+from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 from tests.algorithms.poses.synthetic_capture import random_rotation
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -94,6 +94,8 @@ def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed: int) -> No
     np.testing.assert_array_equal(world.centers[0], 0)
     np.testing.assert_array_equal(world.point_errors_rad, true.point_errors_rad)
     assert "x east, y down, z north, by GPS" in world.frame
+    assert world.axes is WorldAxes.NORTH
+    assert solved.origin_lla is None
     world.check()
 
 
@@ -172,8 +174,5 @@ def test_the_world_tells_where_its_origin_is(home: NDArray[Any]) -> None:
     poses = street(rng, 12)
     lla = {name: tuple(lla_from_local(center, home)) for name, center in zip(poses.names, poses.centers, strict=True)}
     world = georeferenced_poses(poses, fit_gps(poses, lla, UP, gps_noise_m=0.01, rng=rng))
-    origin = origin_of_frame(world.frame)
-    assert origin is not None
-    assert np.abs(local_from_lla(origin, lla[poses.names[0]])).max() < 0.06
-    assert origin_of_frame("the first registered camera") is None
-    assert origin_of_frame("") is None
+    assert world.origin_lla is not None
+    assert np.abs(local_from_lla(world.origin_lla, lla[poses.names[0]])).max() < 0.01

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.frame.vertical import find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, Segments, find_segments, up_from_lines
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 
 UP = np.array([0.0, -1.0, 0.0])
 SIZE_HW = (128, 256)
@@ -170,8 +170,7 @@ def test_an_uncertain_vertical_leaves_the_poses_as_they_are() -> None:
 
 def test_a_world_that_gps_has_turned_stays() -> None:
     poses, pictures = capture()
-    there = "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
-    placed = replace(poses, frame=there)
+    placed = replace(poses, axes=WorldAxes.NORTH, origin_lla=(47.5, 8.25, 410.0))
     same, vertical = level_poses(placed, pictures=pictures)
     assert same is placed
     assert "GPS has already turned it" in vertical.reason
