@@ -41,7 +41,7 @@ from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import tracked, vote
-from pano_mvs.stages.poses import known_poses
+from pano_mvs.stages.poses import known_groups, known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 from tests.stored import write_npz
 
@@ -176,11 +176,31 @@ def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     )
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
-    assert known.rejected["b0.png"].startswith(
-        "out has it in group 1, which has a different frame: use the model sparse/1"
-    )
+    assert known.rejected["b0.png"].startswith("out has it in another group, which has a different frame")
     assert known.rejected["new.png"] == "out has no pose for it"
     assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
+    both, _ = known_groups(out, (*_ORDER, "new.png"))
+    assert [set(group.names) for group in split_groups(both)] == [set(_LARGE), set(_SMALL)]
+    assert both.rejected == {"new.png": "out has no pose for it"}
+
+
+def test_groups_and_photographs_of_a_file_are_not_lost(tmp_path: Path) -> None:
+    """Images of another reconstruction were rejected with "has no pose for it", and a photograph ended the run."""
+    panorama, photograph = {"projection_type": "spherical"}, {"projection_type": "perspective"}
+
+    def shot(x: float, camera: str = "p") -> dict[str, object]:
+        return {"rotation": [0, 0, 0], "translation": [x, 0, 0], "camera": camera}
+
+    cameras = {"p": panorama, "phone": photograph}
+    first = {f"a{idx}.png": shot(idx) for idx in range(3)} | {"b1.png": shot(1, "phone"), "z.png": shot(2, "phone")}
+    second = {"b0.png": shot(0), "b2.png": shot(2)}
+    same = {"c0.png": shot(1), "c1.png": shot(1)}
+    path = tmp_path / "reconstruction.json"
+    path.write_text(json.dumps([{"cameras": cameras, "shots": shots} for shots in (second, first, same)]))
+    known, unusable = known_groups(path, ("a0.png", "a1.png", "a2.png", "b0.png", "b1.png", "b2.png", "c0.png"))
+    assert [group.names for group in split_groups(known)] == [("a0.png", "a1.png", "a2.png"), ("b0.png", "b2.png")]
+    assert known.rejected["b1.png"] == "in reconstruction.json, its camera is perspective, expected spherical"
+    assert unusable == {"z.png": "its camera is perspective, expected spherical"}
 
 
 def _tracked(rooms: Rooms, ctx: Context, count: int = 100) -> TrackedPoints:

@@ -13,6 +13,7 @@ from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
+    FilePoses,
     posed_views,
     read_json_value,
     require_distinct,
@@ -60,32 +61,48 @@ def read_poses(path: Path) -> Poses:
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
         with # are ignored.
 
+    Cameras of other kinds than panoramas are in `rejected`, with the reason.
+
     Raises:
         InputError: if the file is invalid; it names the file, and the line or the key.
     """
-    path = _file_or_model(path)
+    return _groups_in(_file_or_model(path))[0]
+
+
+def _groups_in(path: Path) -> list[Poses]:
+    """Return the poses in a file or a COLMAP model, those of the largest group first."""
     if is_folder(path):
-        return read_colmap_model(path)
+        return [read_colmap_model(path)]
+    found = _read_file(path)
+    scale = "metres, as the file has it" if found.metric else "the unit of the file"
+    groups = []
+    for number, poses in enumerate(found.groups, start=1):
+        frame = f"the world of {path.name}" + (f", group {number}" if len(found.groups) > 1 else "")
+        others = found.others if number == 1 else {}
+        groups.append(Poses.without_points(poses, rejected=others, frame=frame, scale=scale, metric=found.metric))
+    return groups
+
+
+def _read_file(path: Path) -> FilePoses:
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        return _from_file(read_csv(path), path, metric=False)
+        return FilePoses([read_csv(path)])
     if suffix == ".xml":
-        return _from_file(read_metashape(path), path, metric=False)
+        return read_metashape(path)
     if suffix not in _JSON:
         raise InputError(
             f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml and .csv, not {suffix!r}"
         )
     value = read_json_value(path)
-    if isinstance(value, list) and value and all(isinstance(item, dict) and "shots" in item for item in value):
-        poses, metric = opensfm_poses(value, path)
-        return _from_file(poses, path, metric=metric)
+    if isinstance(value, list) and all(isinstance(item, dict) and "shots" in item for item in value):
+        return opensfm_poses(value, path)
     data = require_object(value, path)
     for keys, read in _BY_KEYS:
         if keys <= data.keys():
-            return _from_file(read(data, path), path, metric=False)
+            return read(data, path)
     if "views" in data:
         views, metric = posed_views(data, path)
-        return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
+        return FilePoses([{view.name: view.cam_from_world for view in views}], metric=metric)
     raise InputError(
         f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
         "(OpenSfM): no poses here"
@@ -95,17 +112,20 @@ def read_poses(path: Path) -> Poses:
 def read_groups(path: Path) -> list[Poses]:
     """Return the poses in a file or folder, and those of further groups.
 
-    Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given. Each has its
-    own world. Images of an earlier group are omitted.
+    Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given, further
+    reconstructions of OpenSfM and components of Metashape. Each has its own world. Images of an earlier group are
+    omitted.
     """
-    groups = [read_poses(path)]
     model = _file_or_model(path)
+    found = _groups_in(model)
     number = 1
     while model != path and model.name == "0" and is_colmap_model(model.with_name(str(number))):
-        group = read_poses(model.with_name(str(number)))
+        found += _groups_in(model.with_name(str(number)))
+        number += 1
+    groups: list[Poses] = []
+    for group in found:
         known = {name for earlier in groups for name in earlier.names}
         groups.append(with_cameras(group, np.array([name not in known for name in group.names], np.bool_)))
-        number += 1
     return groups
 
 
@@ -156,11 +176,6 @@ def _file_or_model(path: Path) -> Path:
         f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
         f"of {', '.join(_IN_A_FOLDER)}"
     )
-
-
-def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:
-    scale = "metres, as the file has it" if metric else "the unit of the file"
-    return Poses.without_points(poses, frame=f"the world of {path.name}", scale=scale, metric=metric)
 
 
 def _pose_from_row(row: list[str], where: str) -> Rigid3:
