@@ -34,7 +34,7 @@ from pano_mvs.api import (
 )
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.poses.files import read_groups, recorded_pictures
+from pano_mvs.io.poses.files import match_images, read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 
@@ -199,7 +199,7 @@ class FromModelParams(Params):
 
     path: InputPath = Field(
         description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json, "
-        "sfm_data.json, cameras.sfm, XML of Metashape, or CSV"
+        "sfm_data.json, cameras.sfm, XML of Metashape, CSV, or a trajectory (.txt, .tum)"
     )
 
 
@@ -226,10 +226,10 @@ def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> 
         )
     for name in others:
         ctx.note(f"{name} is not the image whose pose {params.path.name} records: the files differ")
-    known, unusable = known_groups(params.path, tuple(images))
-    if unusable:
-        named = shortened_list([f"{name} ({why})" for name, why in unusable.items()], 5, rest=" … ({total} in all)")
-        ctx.note(f"not used of {params.path.name}, since only panoramas can be: {named}")
+    notes: list[str] = []
+    known = known_groups(params.path, tuple(images), notes)
+    for note in notes:
+        ctx.note(note)
     return checked_poses(known, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 
@@ -271,26 +271,25 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
 
 def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     """Return the largest group of what `known_groups` returns, with the other groups' images rejected."""
-    poses, _ = known_groups(path, images)
+    poses = known_groups(path, images, [])
     largest, *others = split_groups(poses)
     elsewhere = f"{path.name} has it in another group, which has a different frame: give the model of that group alone"
     return replace(largest, rejected=poses.rejected | {name: elsewhere for group in others for name in group.names})
 
 
-def known_groups(path: Path, images: tuple[str, ...]) -> tuple[Poses, dict[str, str]]:
+def known_groups(path: Path, images: tuple[str, ...], notes: list[str]) -> Poses:
     """Return the poses that a file has for the images of a capture, in the capture's order, without points.
 
-    Images without a pose, and images that match the same name in the file, are rejected with the reason.
-
-    Returns:
-        The poses, with groups if the file has several, and why other images in the file cannot be used.
+    Images without a pose, and images that match the same name in the file, are rejected with the reason. Several models
+    in a file are groups. `notes` receives what else in the file is not used, and how a trajectory was matched.
 
     Raises:
         InputError: if the file cannot be used, contains none of the images, or has all of them at the same place.
     """
     models = read_groups(path)
     homes = {name: number for number, model in enumerate(models) for name in model.names}
-    known = match_image_names(images, homes)
+    known, how = match_images(images, list(homes), path)
+    notes += [how] if how else []
     if not known:
         raise InputError(
             f"{path}: none of its {len(homes)} {plural(len(homes), 'image')} is one of this "
@@ -320,8 +319,10 @@ def known_groups(path: Path, images: tuple[str, ...]) -> tuple[Poses, dict[str, 
         for name in group.names
     }
     missing = {name: f"{path.name} has no pose for it" for name in images if name not in rejected}
-    others = {name: why for name, why in unusable.items() if name not in seen.values()}
-    return join_groups(apart, order=images, rejected=rejected | missing), others
+    others = [f"{name} ({why})" for name, why in unusable.items() if name not in seen.values()]
+    if others:
+        notes.append(f"not used of {path.name}, since only panoramas can be: {shortened_list(others, 5)}")
+    return join_groups(apart, order=images, rejected=rejected | missing)
 
 
 def _in_one_place(poses: Poses) -> bool:

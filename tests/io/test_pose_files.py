@@ -255,7 +255,7 @@ def matrix(x: float, last: tuple[int, ...] = (0, 0, 0, 1)) -> list[Any]:
     ("form", "at", "value", "what"),
     [
         ("CSV", (), "", ":1: the first line must be name,tx"),
-        ("CSV", HEADER, "image,x,y,z", ":3: the first line must be name,tx"),
+        ("CSV", HEADER, "image,a,b,c", ":3: the first line must be name,tx"),
         ("CSV", (), HEADER, ": contains no poses"),
         ("CSV", (), f"{HEADER}\n\na,1,2,3", ":3: expected a name and 7 numbers .* got 4 cells"),
         ("CSV", (), f"{HEADER}\na,1,2,3,1,0,0,zero", ":2: could not convert"),
@@ -379,14 +379,14 @@ def test_labels_that_repeat_are_told_apart_by_their_groups(tmp_path: Path) -> No
     ("name", "what"),
     [
         ("binary.json", r"binary\.json: not a text file in UTF-8"),
-        ("poses.txt", r"poses\.txt: poses are read from"),
+        ("poses.doc", r"poses\.doc: poses are read from"),
         ("gone.csv", r"gone\.csv: no such file or folder"),
         ("", "no poses here"),
     ],
 )
 def test_what_holds_no_poses_is_named(tmp_path: Path, name: str, what: str) -> None:
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
-    (tmp_path / "poses.txt").touch()
+    (tmp_path / "poses.doc").touch()
     with pytest.raises(InputError, match=what):
         read_poses(tmp_path / name)
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
+from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.json_files import (
     FilePoses,
     posed_views,
@@ -23,6 +26,8 @@ from pano_mvs.io.poses.json_files import (
 )
 from pano_mvs.io.poses.metashape import read_metashape
 from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
+from pano_mvs.io.poses.positions import NO_POSES, holds_positions, read_positions
+from pano_mvs.io.poses.trajectories import SUFFIXES, match_times, read_trajectory
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
@@ -59,7 +64,8 @@ def read_poses(path: Path) -> Poses:
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
-        with # are ignored.
+        with # are ignored;
+      * a trajectory of the TUM benchmark, .txt or .tum, whose images are called by their times (see `match_images`).
 
     Cameras of other kinds than panoramas are in `rejected`, with the reason.
 
@@ -89,10 +95,15 @@ def _read_file(path: Path) -> FilePoses:
         return FilePoses([read_csv(path)])
     if suffix == ".xml":
         return read_metashape(path)
-    if suffix not in _JSON:
+    if suffix not in (*_JSON, *SUFFIXES):
         raise InputError(
-            f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml and .csv, not {suffix!r}"
+            f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml, .csv, and .txt or .tum "
+            f"(trajectories), not {suffix!r}"
         )
+    if suffix in SUFFIXES:
+        return FilePoses([read_trajectory(path)])
+    if suffix == ".json" and holds_positions(path):
+        raise InputError(f"{path}: {NO_POSES}")
     value = read_json_value(path)
     if isinstance(value, list) and all(isinstance(item, dict) and "shots" in item for item in value):
         return opensfm_poses(value, path)
@@ -129,6 +140,29 @@ def read_groups(path: Path) -> list[Poses]:
     return groups
 
 
+def positions_in(path: Path) -> dict[str, FloatArray]:
+    """Return the position (3,) of each image in a file of positions (`read_positions`), or of poses.
+
+    Raises:
+        InputError: if the file is invalid.
+    """
+    if is_file(path) and holds_positions(path):
+        return read_positions(path)
+    poses = read_poses(path)
+    return dict(zip(poses.names, poses.centers, strict=True))
+
+
+def match_images(images: Sequence[str], names: Sequence[str], path: Path) -> tuple[dict[str, str], str]:
+    """Return the name in a file of poses of each image of a capture, and a note on how they were matched, or "".
+
+    Names are compared by `match_image_names`; those of a trajectory are times, see `match_times`.
+    """
+    if path.suffix.lower() not in SUFFIXES or is_folder(path):
+        return match_image_names(images, names), ""
+    matched, how = match_times(images, names, path)
+    return matched, f"the poses in {path.name} belong to the images by {how}"
+
+
 def recorded_pictures(path: Path) -> dict[str, str]:
     """Return the SHA-256 of the images of poses by name, if the file states them (poses.json)."""
     path = _file_or_model(path)
@@ -150,6 +184,8 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
         rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
     except csv.Error as error:
         raise InputError(f"{path}: not a CSV file ({error})") from error
+    if holds_positions(path):
+        raise InputError(f"{path}: {NO_POSES}")
     if not rows or tuple(rows[0][1]) != CSV_HEADER:
         raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
     poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
@@ -162,7 +198,8 @@ def _file_or_model(path: Path) -> Path:
     if not exists(path):
         raise InputError(
             f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-            "poses.json, a reconstruction.json, a sfm_data.json, a cameras.sfm, an XML file of Metashape or a CSV file"
+            "poses.json, a reconstruction.json, a sfm_data.json, a cameras.sfm, an XML file of Metashape, a CSV file "
+            "or a trajectory (.txt, .tum)"
         )
     if not is_folder(path):
         return path

@@ -197,6 +197,11 @@ def require_distinct(names: list[str], path: Path) -> None:
 
 def _posed_view(entry: Any, where: str) -> PosedView:
     name = image_name(entry, "image", where)
+    if "R" not in entry:
+        raise InputError(
+            f"{where} ({name}): key 'R' is missing, and without a rotation there is no pose. A file of positions alone "
+            "has a key 'center' in each view instead of 'R' and 't', and is for pairs.position and poses.scale"
+        )
     pose = rigid_from_arrays(
         number_array(entry, "R", (3, 3), where=where), number_array(entry, "t", (3,), where=where), f"{where} ({name})"
     )

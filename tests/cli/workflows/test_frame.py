@@ -160,7 +160,7 @@ def test_gps_gives_metres_and_the_compass(pano_mvs: Command, capture: Path, turn
     np.testing.assert_allclose(told["centers"], [60 * pose.center for pose in turned.values()], atol=0.01)
     indoors = pano_mvs("run", workflow, "--out", "out", "--set", "metres.gps_noise_m=20")
     assert indoors.code != 0
-    assert "too close for GPS that is good to 20.0 m" in indoors.flat
+    assert "too close for positions that are good to 20.0 m" in indoors.flat
 
 
 def test_what_gives_no_scale_stops_with_the_reason(pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]) -> None:
