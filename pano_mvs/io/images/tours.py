@@ -187,7 +187,7 @@ def _stated(capture: _Capture, notes: list[str], unreadable: list[str]) -> Itera
             finest = cubes.get(cube_of.get(tiles["f", 0, 0], ""), {}) if tiles else {}
             tiles = max(tiles, finest, key=len)
             if not tiles and panorama is None:
-                tiles, panorama = _alike(scene, capture, file, cubes, by_last_part)
+                tiles, panorama = _alike(scene, capture, file, cubes=cubes, by_last_part=by_last_part)
                 elsewhere += [scene.title or scene.key] if tiles or panorama is not None else []
             pictures = set(tiles.values()) if panorama is None else {panorama}
             if not pictures:
@@ -238,7 +238,12 @@ def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Til
 
 
 def _alike(
-    scene: StatedScene, capture: _Capture, file: Path, cubes: Mapping[str, Tiles], by_last_part: Mapping[str, list[str]]
+    scene: StatedScene,
+    capture: _Capture,
+    file: Path,
+    *,
+    cubes: Mapping[str, Tiles],
+    by_last_part: Mapping[str, list[str]],
 ) -> tuple[Tiles, Path | None]:
     """Return the pictures of a scene whose stated paths do not exist: those with the most similar paths.
 

@@ -42,7 +42,8 @@ def read_metashape(path: Path) -> FilePoses:
     found = []
     for name, camera in _aligned(chunk):
         where, component = f"{path}: camera {name!r}", camera.get("component_id")
-        pose = partial(_pose, camera, where, worlds.get(component), f"{path}: component {component}")
+        world, world_where = worlds.get(component), f"{path}: component {component}"
+        pose = partial(_pose, camera, where, component=world, component_where=world_where)
         found.append(FoundCamera(name, where, sensors.get(camera.get("sensor_id")), "spherical", pose, component))
     return FilePoses.of_cameras(found, path)
 
@@ -64,7 +65,7 @@ def _aligned(chunk: ElementTree.Element) -> list[tuple[str, ElementTree.Element]
 
 
 def _pose(
-    camera: ElementTree.Element, where: str, component: ElementTree.Element | None, component_where: str
+    camera: ElementTree.Element, where: str, *, component: ElementTree.Element | None, component_where: str
 ) -> Rigid3:
     matrix = _numbers(camera.findtext("transform"), (4, 4), where)
     chunk_from_cam = rigid_from_arrays(matrix[:3, :3], matrix[:3, 3], where)
