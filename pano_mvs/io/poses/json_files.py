@@ -66,7 +66,8 @@ class FilePoses:
         ranked = sorted(groups.values(), key=len, reverse=True) or [[]]
         for group in ranked:
             require_distinct([name for name, _ in group], path)
-            others = {name: why for name, why in others.items() if name not in dict(group)}
+        known = {name for group in ranked for name, _ in group}
+        others = {name: why for name, why in others.items() if name not in known}
         return FilePoses([dict(group) for group in ranked], others, metric)
 
 

@@ -108,7 +108,10 @@ def _from_all(poses: Poses, up_in_cam: Mapping[str, Sequence[float]], pictures: 
     vertical = _mean_of_agreeing(known)
     if stated and "sensors" not in vertical.weights:
         off_deg = float(np.rad2deg(angle_between(sensors.up_in_world, vertical.up_in_world)))
-        against = f"{sensors.evidence} are {off_deg:.1f}° off {vertical.evidence}"
+        against = (
+            f"they are {off_deg:.1f}° off {vertical.evidence}. A program that levels pictures may have left them. If "
+            "they are right, set `evidence: sensors` for poses.level"
+        )
         vertical = replace(vertical, unused=against if sensors else sensors.reason)
     if prior is sensors:
         return vertical
