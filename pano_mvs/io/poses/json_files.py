@@ -66,8 +66,8 @@ class FilePoses:
         ranked = sorted(groups.values(), key=len, reverse=True) or [[]]
         for group in ranked:
             require_distinct([name for name, _ in group], path)
-        known = {name for group in ranked for name, _ in group}
-        others = {name: why for name, why in others.items() if name not in known}
+        taken = {name for group in ranked for name, _ in group}
+        others = {name: why for name, why in others.items() if name not in taken}
         return FilePoses([dict(group) for group in ranked], others, metric)
 
 
