@@ -373,14 +373,11 @@ def merge_blocks(
         )
         for number, block in enumerate(blocks)
     ]
-    world = blocks[reference].worlds[0]
     merged = replace(
         Poses.without_points(
             dict(zip(names, final, strict=True)),
             rejected={name: why for block in blocks for name, why in block.rejected.items() if name not in owner},
-            frame=world.frame,
-            scale=world.scale,
-            metric=world.metric,
+            **blocks[reference].worlds[0]._asdict(),
         ),
         **values_of_cameras(own, names),
     )

@@ -10,7 +10,6 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """
 
-from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
 from pano_mvs.algorithms.sweep.costs import register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
@@ -63,6 +62,7 @@ from pano_mvs.scene import (
     TwoView,
     TwoViews,
     Views,
+    WorldAxes,
 )
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_file import decode_image, write_png
@@ -112,6 +112,7 @@ __all__ = [
     "UsageError",
     "Views",
     "Winners",
+    "WorldAxes",
     "arguments_from",
     "checks_settings",
     "chunks",
@@ -120,7 +121,6 @@ __all__ = [
     "is_only_planned",
     "join_groups",
     "lla_from_local",
-    "origin_of_frame",
     "pad_panorama",
     "params_from",
     "per_group",

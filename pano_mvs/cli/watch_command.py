@@ -19,7 +19,7 @@ from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import clock_text, duration_text, one_line, plural
 from pano_mvs.engine.running.output_lock import is_run_gone
-from pano_mvs.results.summary import BLOCKS
+from pano_mvs.results.summary import BLOCKS, INTERRUPTED
 from pano_mvs.session.progress import (
     EVENTS_FILE,
     BlockStarted,
@@ -58,7 +58,7 @@ def _ending(end: RunFinished | None) -> str:
     if end is None:
         return "the run was killed; the same command continues it"
     verdict = end.verdict.judgement if end.verdict is not None else ""
-    reason = f": {end.stopped}" if end.stopped not in ("", "interrupted") else ""
+    reason = f": {end.stopped}" if end.stopped and end.exit_code != INTERRUPTED else ""
     text = f"{ending_text(end.exit_code)} (exit code {end.exit_code})"
     return f"{text} after {duration_text(end.seconds)}{reason}{f'. {verdict}' if verdict else ''}"
 

@@ -14,7 +14,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
-from pano_mvs.scene.upright import states_y_down, states_z_north
+from pano_mvs.scene import WorldAxes
 
 _WINDOW = 10  # cameras whose positions in the capture differ by at most this follow each other closely
 
@@ -145,7 +145,7 @@ def camera_maps(
     links = [link for link in poses.links if link.first in position and link.second in position]
     walk = find_walk(len(names), [(position[link.first], position[link.second]) for link in links if link.inliers])
     chosen = _chosen(links, position, labels, reasons=reasons or {}, walk=walk)
-    north = states_z_north(poses.frame)
+    north = poses.axes is WorldAxes.NORTH
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
         _drawn(
@@ -177,12 +177,12 @@ def _flat(points: FloatArray, axes: tuple[tuple[int, float], ...]) -> FloatArray
 def up_of(poses: PosesSummary) -> FloatArray:
     """Return the up direction in the world, a unit vector (3,).
 
-    It is −y if the frame states so, otherwise the mean `up` of the cameras, which are mostly held upright,
+    It is −y if the world is level, otherwise the mean `up` of the cameras, which are mostly held upright,
     otherwise −y, that of the first camera.
     """
     up = np.array(poses.up or (0, -1, 0), np.float64)
     usable = np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
-    if not usable or states_y_down(poses.frame):
+    if not usable or poses.axes.is_level:
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
 

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, model_serializer, model_validator
 
+from pano_mvs.scene.poses import World, WorldAxes
+
 Number = int | float | None
 Direction = tuple[float, float, float]
 
@@ -136,6 +138,10 @@ class PoseGroup(Entry):
     frame: str = ""  # what the world frame is
     scale: str = ""  # what the unit of length is
     metric: bool = False  # whether lengths are in metres
+    # "level": y points down along gravity; "north": z also points north; "unknown"
+    axes: WorldAxes = WorldAxes.UNKNOWN
+    # latitude and longitude (deg) and altitude (m) of the origin of the world; None if they are not known
+    origin_lla: tuple[float, float, float] | None = None
     points: int | None = None  # number of triangulated points
     # mean of the cameras' up directions in the world, a unit vector; None if they do not agree
     up: Direction | None = None
@@ -162,9 +168,11 @@ class PosesSummary(OptionalEntry):
     p_right: Mapping[str, float | None] = {}
     centers: tuple[Direction, ...] = ()  # of the registered cameras in the world, in the order of `registered`
     points: int = 0  # number of triangulated points
-    frame: str = ""  # what the world frame is; of the largest group, as are `scale`, `metric` and `up`
+    frame: str = ""  # what the world frame is; of the largest group, as are the next five fields
     scale: str = ""  # what the unit of length is
     metric: bool = False  # whether lengths are in metres
+    axes: WorldAxes = WorldAxes.UNKNOWN  # what is known of the axes of the world; see `PoseGroup`
+    origin_lla: tuple[float, float, float] | None = None
     up: Direction | None = None  # mean of the cameras' up directions, a unit vector; None if they do not agree
     groups: tuple[PoseGroup, ...] = ()  # of cameras that no reliable pair connects, the largest first
     links: tuple[PairLink, ...] = ()  # the pairs that were matched
@@ -184,7 +192,7 @@ class PosesSummary(OptionalEntry):
             links=tuple(link for link in self.links if link.first in names and link.second in names),
             doubts={name: self.doubts[name] for name in names if name in self.doubts},
             p_right={name: self.p_right[name] for name in names if name in self.p_right},
-            **{name: getattr(group, name) for name in ("frame", "scale", "metric", "up")},
+            **{name: getattr(group, name) for name in (*World._fields, "up")},
             points=group.points or 0,
         )
 

@@ -167,7 +167,7 @@ def _masks(summary: RunSummary) -> Iterator[Finding]:
 
 
 def _stopped(summary: RunSummary) -> Iterator[Finding]:
-    if summary.stopped == "interrupted":
+    if summary.exit_code == INTERRUPTED:
         yield Finding(
             "fair",
             "The run was interrupted. This report shows what it had finished.",

@@ -4,7 +4,7 @@ from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features, GlobalDescriptor, WeakImage, WeakImages
 from pano_mvs.scene.files import Files
 from pano_mvs.scene.panorama import Panorama
-from pano_mvs.scene.poses import Pose, Poses
+from pano_mvs.scene.poses import Pose, Poses, WorldAxes
 from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
 from pano_mvs.scene.scores import Scores
@@ -31,4 +31,5 @@ __all__ = [
     "Views",
     "WeakImage",
     "WeakImages",
+    "WorldAxes",
 ]

@@ -115,8 +115,8 @@ def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:
 def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], *, number: int) -> Poses:
     names = tuple(np.array(poses.names, object)[cameras])
     tracks = cameras[poses.track_image_idx] & points[poses.track_point_idx]
-    world = poses.worlds[number]
-    values: dict[str, Any] = {name: getattr(poses, name) for name in PER_CAMERA}
+    known = {name: getattr(poses, name) for name in PER_CAMERA}
+    values: dict[str, Any] = {name: None if value is None else value[cameras] for name, value in known.items()}
     return replace(
         poses,
         names=names,
@@ -130,14 +130,12 @@ def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_],
         track_bearings=poses.track_bearings[tracks],
         track_sigmas_rad=None if poses.track_sigmas_rad is None else poses.track_sigmas_rad[tracks],
         rejected={},
-        frame=world.frame,
-        scale=world.scale,
-        metric=world.metric,
         group_idx=None,
         other_worlds=(),
         evidence={name: poses.evidence[name] for name in names if name in poses.evidence},
         doubts={name: poses.doubts[name] for name in names if name in poses.doubts},
-        **{name: None if value is None else value[cameras] for name, value in values.items()},
+        **values,
+        **poses.worlds[number]._asdict(),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -55,18 +56,37 @@ PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_
 """Fields of `Poses` that may hold a number for each camera."""
 
 
+class WorldAxes(StrEnum):
+    """What is known of the directions of the axes of a world."""
+
+    UNKNOWN = "unknown"
+    LEVEL = "level"
+    """y points down along gravity."""
+    NORTH = "north"
+    """y points down along gravity, z north, and therefore x east."""
+
+    @property
+    def is_level(self) -> bool:
+        """Whether y is known to point down along gravity."""
+        return self is not WorldAxes.UNKNOWN
+
+
 class World(NamedTuple):
     """The world of one group of cameras.
 
     Attributes:
-        frame: description of the world frame.
+        frame: description of the world frame, for readers; nothing is decided by it.
         scale: description of the source of the unit of length.
         metric: whether the unit of length is the metre.
+        axes: what is known of the directions of the axes.
+        origin_lla: latitude (deg), longitude (deg) and altitude (m) of the origin; None if they are not known.
     """
 
     frame: str
     scale: str
     metric: bool
+    axes: WorldAxes = WorldAxes.UNKNOWN
+    origin_lla: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +104,8 @@ class Poses(Record):
         track_image_idx: (T,) int32: … in this image (a position in `names`) …
         track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
         rejected: name of every image that could not be registered, with the reason.
-        frame: description of the world frame; with several groups, of group 0, as the next two.
+        frame: description of the world frame; with several groups, of group 0, as `scale`, `metric`, `axes` and
+            `origin_lla`, which `World` explains.
         scale: description of the source of the unit of length.
         metric: whether the unit of length is the metre.
         center_stds: (N,) float64 standard deviation of each camera's centre, scene units, relative to the first camera
@@ -104,10 +125,12 @@ class Poses(Record):
         doubts: name of every registered image whose pose is doubtful, with the reason.
         track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
             observations by it. None: unknown, equal weights.
+        axes: what is known of the directions of the world's axes.
+        origin_lla: latitude (deg), longitude (deg) and altitude (m) of the world's origin; None if they are not known.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
-    kind_version: ClassVar[int] = 4
+    kind_version: ClassVar[int] = 5  # since `axes` and `origin_lla`, which were sentences in `frame`
     explodes_into: ClassVar[type[Record] | None] = Pose
 
     names: tuple[str, ...]
@@ -133,10 +156,14 @@ class Poses(Record):
     doubts: dict[str, str] = field(default_factory=dict)
     other_worlds: tuple[World, ...] = ()
     track_sigmas_rad: NDArray[np.float32] | None = None
+    axes: WorldAxes = WorldAxes.UNKNOWN
+    origin_lla: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Convert the worlds, which are stored as lists."""
-        object.__setattr__(self, "other_worlds", tuple(World(*world) for world in self.other_worlds))
+        """Convert the axes and the worlds, which are stored as text and lists."""
+        object.__setattr__(self, "axes", WorldAxes(self.axes))
+        others = (World(*world) for world in self.other_worlds)
+        object.__setattr__(self, "other_worlds", tuple(one._replace(axes=WorldAxes(one.axes)) for one in others))
 
     @staticmethod
     def without_points(
@@ -146,8 +173,10 @@ class Poses(Record):
         frame: str,
         scale: str,
         metric: bool,
+        axes: WorldAxes = WorldAxes.UNKNOWN,
+        origin_lla: tuple[float, float, float] | None = None,
     ) -> Poses:
-        """Return poses without sparse points, such as poses from a file."""
+        """Return poses without sparse points, such as poses from a file; see `World` for the last five arguments."""
         count = len(poses)
         return Poses(
             names=tuple(poses),
@@ -163,6 +192,8 @@ class Poses(Record):
             frame=frame,
             scale=scale,
             metric=metric,
+            axes=axes,
+            origin_lla=origin_lla,
         )
 
     def cam_from_world(self, image_idx: int) -> Rigid3:
@@ -189,7 +220,7 @@ class Poses(Record):
     @property
     def worlds(self) -> tuple[World, ...]:
         """The world of each group, beginning with the largest."""
-        return (World(self.frame, self.scale, self.metric), *self.other_worlds)
+        return (World(self.frame, self.scale, self.metric, self.axes, self.origin_lla), *self.other_worlds)
 
     def explode(self) -> Mapping[str, Pose]:
         """Return the pose of each registered image."""

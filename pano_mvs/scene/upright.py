@@ -7,7 +7,6 @@ their digits.
 
 from __future__ import annotations
 
-import re
 from typing import Final
 
 import numpy as np
@@ -35,34 +34,22 @@ def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
 
 
 _QUARTER_TURN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_STATES_DOWN: Final = re.compile(r"\by down\b")
-_STATES_NORTH: Final = re.compile(r"\bz north\b")
 
 
 def world_up(poses: Poses) -> FloatArray:
     """Return the up direction in the world of poses of one group, (3,), for display.
 
-    It is −y if the frame states that y points down, as `poses.level` writes. Otherwise it is the axis of the world,
+    It is −y if the world is level, as `poses.level` makes it. Otherwise it is the axis of the world,
     with its sign, that is nearest to the mean up direction of the cameras, or that mean itself if it is more than 20°
     from every axis. If the cameras do not agree, it is −y.
     """
-    mean = None if states_y_down(poses.frame) else mean_up_direction(poses.rotations)
+    mean = None if poses.axes.is_level else mean_up_direction(poses.rotations)
     if mean is None:
         return np.array(WORLD_UP)
     largest = int(np.argmax(np.abs(mean)))
     axis = np.zeros(3)
     axis[largest] = np.sign(mean[largest])
     return axis if float(axis @ mean) >= np.cos(np.deg2rad(20.0)) else mean
-
-
-def states_y_down(frame: str) -> bool:
-    """Return whether the description of a world frame states that y points down, along gravity."""
-    return _STATES_DOWN.search(frame) is not None
-
-
-def states_z_north(frame: str) -> bool:
-    """Return whether the description of a world frame states that z points north, as `poses.level` writes."""
-    return _STATES_NORTH.search(frame) is not None
 
 
 def z_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:

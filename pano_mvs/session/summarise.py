@@ -195,16 +195,12 @@ def poses_summary(
         p_right=_probabilities(poses),
         centers=poses.centers.tolist(),
         points=len(poses.points_in_world),
-        frame=poses.frame,
-        scale=poses.scale,
-        metric=poses.metric,
+        **poses.worlds[0]._asdict(),
         up=_up(groups[0]),
         groups=tuple(
             PoseGroup(
                 images=tuple(group.names),
-                frame=group.frame,
-                scale=group.scale,
-                metric=group.metric,
+                **group.worlds[0]._asdict(),
                 points=len(group.points_in_world),
                 up=_up(group),
                 z_up_from_world=tuple((float(x), float(y), float(z)) for x, y, z in z_up_from_world(world_up(group))),

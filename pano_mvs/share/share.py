@@ -26,7 +26,7 @@ from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import FilePart, PointCloud, Poses
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.page_folder import PageFolder
@@ -136,7 +136,7 @@ def share_run(
     if others:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
-    frame = page_from_world(cameras, is_level=states_y_down(largest.frame))
+    frame = page_from_world(cameras, is_level=largest.axes.is_level)
     page = PageFolder(folder)
     source = resolved(run.summary.source_folder or run.out)
     # The name of the folder of the capture, which may hold its images in `images`; else of the output.

@@ -47,7 +47,7 @@ from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
-from pano_mvs.scene.upright import WORLD_UP, states_y_down
+from pano_mvs.scene.upright import WORLD_UP
 
 
 def bytes_per_pixel(own: int, *, each_source: int = 0) -> Callable[[Params, Mapping[str, Any]], int]:
@@ -92,7 +92,7 @@ def sky(
             source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for _, other in used],
             valid=image.load_mask(),
             source_valid=[source.load_mask() for source, _ in used],
-            up=pose.cam_from_world.rotation @ WORLD_UP if states_y_down(poses.worlds[pose.group].frame) else None,
+            up=pose.cam_from_world.rotation @ WORLD_UP if poses.worlds[pose.group].axes.is_level else None,
         )
         found = found if range_map.sky is None else found | range_map.sky
         result = with_ranges(replace(range_map, sky=found), range_map.range)

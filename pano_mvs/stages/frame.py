@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
+from pano_mvs.algorithms.poses.frame.georeference import fit_gps, fit_survey, georeferenced_poses, scaled_by_gps
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations as without_scale_factors
 from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
-from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, stage
+from pano_mvs.api import All, Context, InputError, InputPath, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.poses.files import match_images, positions_in
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 
@@ -46,6 +47,8 @@ def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context
         )
         levelled.append(level_group)
         which = f"group {number}: " if len(groups) > 1 else ""
+        if vertical.unused:
+            ctx.note(f"{which}pitch and roll in the metadata were not used: {vertical.unused}")
         if not vertical:
             ctx.note(f"{which}the world was not levelled: {vertical.reason}")
         else:
@@ -105,14 +108,18 @@ class ScaleParams(Params):
         default=None, gt=0, description="median height of the cameras above the floor, in metres"
     )
     gps: bool = Field(default=False, description="scale by the GPS positions in the images' metadata")
+    positions: InputPath | None = Field(
+        default=None, description="scale by surveyed positions in metres: a table with name, x, y, z"
+    )
     factor: float | None = Field(default=None, gt=0, description="metres per unit of the poses")
     group: int = Field(default=0, ge=0, description="group of the poses that `factor` applies to; 0 is the largest")
     origin: str = Field(default="", description="where `factor` comes from, for run.json and the report")
     align: Literal["keep", "gps"] = Field(
-        default="keep", description="gps also rotates the world: x east, y down, z north"
+        default="keep",
+        description="gps also rotates the world: x east, y down, z north; with positions, along x and y of the survey",
     )
     gps_noise_m: float = Field(
-        default=3.0, gt=0, description="standard deviation of GPS positions along an axis, in metres"
+        default=3.0, gt=0, description="standard deviation of GPS or surveyed positions along an axis, in metres"
     )
     vertical: Literal[Evidence, "world"] = Field(
         default="auto",
@@ -121,11 +128,11 @@ class ScaleParams(Params):
 
     @model_validator(mode="after")
     def _one_origin(self) -> ScaleParams:
-        given = [self.baseline is not None, self.camera_height_m is not None, self.gps, self.factor is not None]
-        if sum(given) != 1:
-            raise ValueError("give exactly one of baseline, camera_height_m, gps: true, factor")
-        if self.align == "gps" and not self.gps:
-            raise ValueError("align: gps requires gps: true")
+        lengths = (self.baseline, self.camera_height_m, self.positions, self.factor)
+        if sum(given is not None for given in lengths) + self.gps != 1:
+            raise ValueError("give exactly one of baseline, camera_height_m, gps: true, positions, factor")
+        if self.align == "gps" and not (self.gps or self.positions):
+            raise ValueError("align: gps requires gps: true or positions")
         return self
 
 
@@ -133,8 +140,8 @@ class ScaleParams(Params):
 def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Context) -> Poses:
     """Scale poses to metres by a known length.
 
-    The length is the distance between two images, the height of the cameras above the floor, GPS positions, or a
-    factor. Everything computed from the poses is then in metres: ranges, cloud, COLMAP model. If there are several
+    The length is the distance between two images, the height of the cameras above the floor, GPS or surveyed positions,
+    or a factor. Everything computed from the poses is then in metres: ranges, cloud, COLMAP model. If there are several
     groups of poses, a distance between two images scales the group that contains both, a factor the largest group;
     height and GPS scale every group for which they can be determined. Other groups keep their unit, and the report says
     so.
@@ -226,13 +233,20 @@ def _ends(images: All[Panorama], baseline: BaselineParams) -> tuple[str, str]:
 
 
 def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, *, ctx: Context) -> Poses:
-    positions = {name: image.position_lla for name, image in images.items() if image.position_lla is not None}
     up = _up(poses, images, params.vertical)
-    fit = fit_gps(poses, positions, up, gps_noise_m=params.gps_noise_m, rng=ctx.rng)
+    if params.positions is not None:
+        place = positions_in(params.positions)
+        matched, _ = match_images(tuple(images), tuple(place), params.positions)
+        surveyed = {name: place[there] for name, there in matched.items()}
+        survey = params.positions.name
+        fit = fit_survey(poses, surveyed, up, noise_m=params.gps_noise_m, rng=ctx.rng, survey=survey)
+    else:
+        positions = {name: image.position_lla for name, image in images.items() if image.position_lla is not None}
+        fit = fit_gps(poses, positions, up, gps_noise_m=params.gps_noise_m, rng=ctx.rng)
     if not fit:
         raise InputError(
-            f"GPS gives no scale: {fit.reason}. Give a baseline or camera_height_m instead, or set gps_noise_m for a "
-            "more accurate receiver"
+            f"no scale by {fit.source}: {fit.reason}. Give a baseline or camera_height_m instead, or set gps_noise_m "
+            "if the positions are more accurate"
         )
     if "gps_residual_m" not in ctx.metrics:  # the largest group's
         ctx.metric("gps_residual_m", fit.residual_m)

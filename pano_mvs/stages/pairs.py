@@ -39,8 +39,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
-from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.poses.files import match_images, positions_in
 
 
 def _memory_of_auto(params: Params, count: int) -> int:
@@ -149,7 +148,8 @@ class PositionParams(Params):
     """Settings of pairs.position."""
 
     path: InputPath | None = Field(
-        default=None, description="positions from a COLMAP model, poses.json, transforms.json or CSV instead of GPS"
+        default=None,
+        description="positions in a table with name, x, y, z, or in any input of poses.from_model, instead of GPS",
     )
 
 
@@ -157,9 +157,11 @@ class PositionParams(Params):
 def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pairs:
     """Match each image with the nearest ones, by GPS or by approximately known poses."""
     if params.path is not None:
-        model = read_poses(params.path)
-        place = dict(zip(model.names, model.centers, strict=True))
-        positions = {name: place[known] for name, known in match_image_names(images, model.names).items()}
+        place = positions_in(params.path)
+        matched, how = match_images(tuple(images), tuple(place), params.path)
+        positions = {name: place[known] for name, known in matched.items()}
+        if how:
+            ctx.note(how)
     else:
         positions = gps_positions(images)
     if not positions:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -32,10 +33,10 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.poses.files import read_groups, recorded_pictures
-from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.io.poses.files import match_images, read_groups, recorded_pictures
+from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 
 @params_from(solve_scaled_translation, own_last=True)
@@ -196,7 +197,7 @@ class FromModelParams(Params):
 
     path: InputPath = Field(
         description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json, "
-        "sfm_data.json, cameras.sfm, XML of Metashape, or CSV"
+        "sfm_data.json, cameras.sfm, XML of Metashape, CSV, or a trajectory (.txt, .tum)"
     )
 
 
@@ -205,7 +206,8 @@ def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> 
     """Read known poses from a COLMAP model, poses.json, nerfstudio's transforms.json, or CSV.
 
     Image names are compared with and without their folders and extensions. If the file contains the SHA-256 of its
-    images, the hashes are compared too: poses of other images with the same names are rejected.
+    images, the hashes are compared too: poses of other images with the same names are rejected. Several models, such as
+    reconstructions of OpenSfM or components of Metashape, are groups of poses. Photographs in the file are named.
     """
     recorded = recorded_pictures(params.path)
     matched = {
@@ -222,7 +224,10 @@ def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> 
         )
     for name in others:
         ctx.note(f"{name} is not the image whose pose {params.path.name} records: the files differ")
-    known = known_poses(params.path, tuple(images))
+    notes: list[str] = []
+    known = known_groups(params.path, tuple(images), notes)
+    for note in notes:
+        ctx.note(note)
     return checked_poses(known, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 
@@ -263,53 +268,61 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
 
 
 def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
+    """Return the largest group of what `known_groups` returns, with the other groups' images rejected."""
+    poses = known_groups(path, images, [])
+    largest, *others = split_groups(poses)
+    elsewhere = f"{path.name} has it in another group, which has a different frame: give the model of that group alone"
+    return replace(largest, rejected=poses.rejected | {name: elsewhere for group in others for name in group.names})
+
+
+def known_groups(path: Path, images: tuple[str, ...], notes: list[str]) -> Poses:
     """Return the poses that a file has for the images of a capture, in the capture's order, without points.
 
-    Images without a pose, and images that match the same name in the file, are rejected with the reason. If an output
-    folder has several groups of poses, the largest one is read.
+    Images without a pose, and images that match the same name in the file, are rejected with the reason. Several models
+    in a file are groups. `notes` receives what else in the file is not used, and how a trajectory was matched.
 
     Raises:
         InputError: if the file cannot be used, contains none of the images, or has all of them at the same place.
     """
-    model, *others = read_groups(path)
-    known = match_image_names(images, model.names)
+    models = read_groups(path)
+    homes = {name: number for number, model in enumerate(models) for name in model.names}
+    known, how = match_images(images, list(homes), path)
+    notes += [how] if how else []
     if not known:
         raise InputError(
-            f"{path}: none of its {len(model.names)} {plural(len(model.names), 'image')} is one of this "
-            f"capture (it has {', '.join(model.names[:3])} …, the capture "
+            f"{path}: none of its {len(homes)} {plural(len(homes), 'image')} is one of this "
+            f"capture (it has {', '.join(list(homes)[:3])} …, the capture "
             f"{', '.join(images[:3])} …)"
         )
-    position = {name: idx for idx, name in enumerate(model.names)}
     claims = Counter(known.values())
-    poses = {
-        name: model.cam_from_world(position[known[name]])
-        for name in images
-        if name in known and (claims[known[name]] == 1 or known[name] == name)
-    }
-    centers = np.array([pose.center for pose in poses.values()])
-    if len(centers) > 1 and np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())):
-        raise InputError(f"{path}: all {len(centers)} cameras are in the same place; depth needs different places")
+    clear = {name: there for name, there in known.items() if claims[there] == 1 or there == name}
     rejected = {
-        name: f"{path.name} has one pose, {known[name]!r}, that matches several images"
-        if name in known
-        else _why_unknown(name, path, others)
-        for name in images
-        if name not in poses
+        name: f"{path.name} has one pose, {there!r}, that matches several images" for name, there in known.items()
     }
-    return Poses.without_points(
-        poses,
-        rejected=rejected,
-        frame=model.frame,
-        scale=model.scale,
-        metric=model.metric,
-    )
+    unusable = models[0].rejected
+    seen = match_image_names([name for name in images if name not in known], unusable)
+    rejected |= {name: f"in {path.name}, {unusable[there]}" for name, there in seen.items()}
+    groups = []
+    for number, model in enumerate(models):
+        cameras = model.cameras
+        poses = {name: cameras[there] for name, there in clear.items() if homes[there] == number}
+        groups.append(Poses.without_points(poses, **model.worlds[0]._asdict()))
+    apart = [group for group in groups if not _in_one_place(group)]
+    if not apart:
+        raise InputError(f"{path}: all {len(clear)} cameras are in the same place; depth needs different places")
+    rejected |= {
+        name: f"{path.name} has all cameras of its group in the same place"
+        for group in groups
+        if _in_one_place(group)
+        for name in group.names
+    }
+    missing = {name: f"{path.name} has no pose for it" for name in images if name not in rejected}
+    others = [f"{name} ({why})" for name, why in unusable.items() if name not in seen.values()]
+    if others:
+        notes.append(f"not used of {path.name}, since only panoramas can be: {shortened_list(others, 5)}")
+    return join_groups(apart, order=images, rejected=rejected | missing)
 
 
-def _why_unknown(name: str, path: Path, others: Sequence[Poses]) -> str:
-    for number, group in enumerate(others, start=1):
-        if match_image_names((name,), group.names):
-            return (
-                f"{path.name} has it in group {number}, which has a different frame: use the model sparse/{number} "
-                "for that group"
-            )
-    return f"{path.name} has no pose for it"
+def _in_one_place(poses: Poses) -> bool:
+    centers = poses.centers
+    return len(centers) > 1 and bool(np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())))

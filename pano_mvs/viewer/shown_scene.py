@@ -19,7 +19,7 @@ from pano_mvs.io.ply import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
-from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 
@@ -106,7 +106,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
             f"{path}: contains no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
             "folder of a run; its report.html shows what happened"
         )
-    up, ahead = _frame(cameras, is_level=states_y_down(chosen.frame))
+    up, ahead = _frame(cameras, is_level=chosen.axes.is_level)
     return ShownScene(
         name=resolved(path).name,
         cloud=cloud,

@@ -23,7 +23,7 @@ from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, rotation_from_rotvec
-from pano_mvs.scene import FilePart, Panorama, Poses
+from pano_mvs.scene import FilePart, Panorama, Poses, WorldAxes
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.range_scenes import TRUSTED, box_range
@@ -40,10 +40,10 @@ def _room() -> tuple[list[Picture], list[Rigid3], list[NDArray[np.float32]]]:
     return [picture for picture, _ in views], poses, [truth for _, truth in views]
 
 
-def _floors(frame: str, folder: Path, missing: int = 0) -> Structure:
+def _floors(axes: WorldAxes, folder: Path, missing: int = 0) -> Structure:
     pictures, cameras, _ = _room()
     named = {f"{idx}.png": picture for idx, picture in enumerate(pictures)}
-    poses = Poses.without_points(dict(zip(named, cameras, strict=True)), frame=frame, scale="", metric=True)
+    poses = Poses.without_points(dict(zip(named, cameras, strict=True)), frame="", scale="", metric=True, axes=axes)
     images = {}
     for name, picture in list(named.items())[missing:]:
         Image.fromarray(picture).save(folder / name)
@@ -52,7 +52,7 @@ def _floors(frame: str, folder: Path, missing: int = 0) -> Structure:
 
 
 def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
-    found = _floors("y down", tmp_path)
+    found = _floors(WorldAxes.LEVEL, tmp_path)
     heights = found.offsets * found.normals_in_world[:, 1]
     assert np.abs(heights - FLOOR).min() < 0.03 * FLOOR
     assert (found.normals_in_world[:, 1] < 0).all()
@@ -60,12 +60,12 @@ def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
 
 
 def test_views_without_an_image_are_left_out(tmp_path: Path) -> None:
-    assert len(_floors("y down", tmp_path, missing=1)) >= 1
-    assert len(_floors("y down", tmp_path, missing=3)) == 0
+    assert len(_floors(WorldAxes.LEVEL, tmp_path, missing=1)) >= 1
+    assert len(_floors(WorldAxes.LEVEL, tmp_path, missing=3)) == 0
 
 
 def test_without_known_gravity_nothing_is_level(tmp_path: Path) -> None:
-    assert len(_floors("the first camera", tmp_path)) == 0
+    assert len(_floors(WorldAxes.UNKNOWN, tmp_path)) == 0
 
 
 def test_planes_before_a_camera_give_the_ranges_of_its_rays() -> None:

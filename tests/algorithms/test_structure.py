@@ -31,7 +31,7 @@ from pano_mvs.algorithms.structure.view import (
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
-from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene import Poses, RangeMap, WorldAxes
 from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
@@ -65,8 +65,8 @@ class Box:
             self.maps[name] = as_map(np.where(wall, 1.03 * ranges, ranges), np.where(edge, SEEN, TRUSTED))
             self.cams[name] = Rigid3.from_center(np.eye(3), center) @ turned
 
-    def structure(self, frame: str = "y down") -> Structure:
-        poses = Poses.without_points(self.cams, frame=frame, scale="", metric=True)
+    def structure(self, axes: WorldAxes = WorldAxes.LEVEL) -> Structure:
+        poses = Poses.without_points(self.cams, frame="", scale="", metric=True, axes=axes)
         return find_structure(poses, self.maps, self.pictures.__getitem__, rng=np.random.default_rng(0))
 
     def laid(self, structure: Structure, name: str = "0.png", **changes: Any) -> RangeMap:
@@ -368,7 +368,7 @@ def test_what_a_view_confirms_below_the_floor_stays(box: Box, planes: Structure)
 
 
 def test_without_gravity_there_are_no_planes(box: Box) -> None:
-    structure = box.structure(frame="the first registered camera")
+    structure = box.structure(WorldAxes.UNKNOWN)
     assert len(structure) == 0
     np.testing.assert_array_equal(box.laid(structure).range, box.maps["0.png"].range)
 
@@ -382,7 +382,7 @@ def test_no_more_than_four_views_are_in_memory_at_a_time(box: Box, monkeypatch: 
 
     monkeypatch.setattr(planes_module, "find_planes", recorded)
     monkeypatch.setattr(planes_module, "find_mirrors", recorded)
-    poses = Poses.without_points(box.cams, frame="y down", scale="", metric=True)
+    poses = Poses.without_points(box.cams, frame="", scale="", metric=True, axes=WorldAxes.LEVEL)
     find_structure(poses, box.maps, box.pictures.__getitem__, rng=np.random.default_rng(0), threads=64)
     assert used == [4, 4]
 

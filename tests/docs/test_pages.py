@@ -59,6 +59,7 @@ def test_quickstart_command_names_a_workflow_that_is_there() -> None:
 @pytest.mark.parametrize("line", block("frames_and_scale.md", "variants").splitlines())
 def test_every_way_to_metres_is_accepted(tmp_path: Path, line: str) -> None:
     (tmp_path / "photos").mkdir()
+    (tmp_path / "survey.csv").touch()
     text, count = re.subn(r"  metres: .*", lambda _: f"  {line}", block("frames_and_scale.md", "workflow"))
     assert count == 1
     (tmp_path / "mine.yaml").write_text(text)

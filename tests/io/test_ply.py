@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pano_mvs.api import Context, InputError, PointCloud, Poses
+from pano_mvs.api import Context, InputError, PointCloud, Poses, WorldAxes
 from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.io.ply import RGB, open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
@@ -117,9 +117,6 @@ def test_a_file_is_read_in_parts_with_its_normals(tmp_path: Path) -> None:
     assert list(open_ply_points(tmp_path / "c.ply").chunks()) == []
 
 
-LEVEL = "y down along gravity"
-
-
 def the_cloud(count: int = 300) -> PointCloud:
     rng = np.random.default_rng(7)
     normals = rng.normal(size=(count, 3))
@@ -128,9 +125,9 @@ def the_cloud(count: int = 300) -> PointCloud:
     return PointCloud(points, normals.astype(np.float32), np.zeros((count, 3), np.uint8), np.full(count, 3, np.uint8))
 
 
-def the_poses(frame: str = LEVEL, rotation: np.ndarray | None = None) -> Poses:
+def the_poses(axes: WorldAxes = WorldAxes.LEVEL, rotation: np.ndarray | None = None) -> Poses:
     pose = Rigid3(np.eye(3) if rotation is None else rotation, np.zeros(3))
-    return Poses.without_points({"a.png": pose}, frame=frame, scale="", metric=False)
+    return Poses.without_points({"a.png": pose}, frame="", scale="", metric=False, axes=axes)
 
 
 def exported(folder: Path, poses: Poses | None, **settings: object) -> Path:
@@ -151,7 +148,7 @@ def test_other_programs_see_z_up(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(seen, np.float32), np.stack([x, z, -y], axis=-1))
 
 
-@pytest.mark.parametrize("poses", [None, the_poses(), the_poses("of a file", rotation_from_rotvec([0.7, 0, 0]))])
+@pytest.mark.parametrize("poses", [None, the_poses(), the_poses(WorldAxes.UNKNOWN, rotation_from_rotvec([0.7, 0, 0]))])
 def test_our_readers_return_to_the_world(tmp_path: Path, poses: Poses | None) -> None:
     path, cloud = exported(tmp_path, poses), the_cloud()
     file, back = open_ply_points(path), read_ply(path)
@@ -182,7 +179,7 @@ def test_the_world_frame_can_be_kept_without_a_comment(tmp_path: Path) -> None:
 def test_a_world_that_has_z_up_already_is_not_turned(tmp_path: Path) -> None:
     """Such as a COLMAP model that was aligned to a map: y of the camera is down, −z of the world."""
     cam_from_world = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    path = exported(tmp_path, the_poses("of a file", cam_from_world))
+    path = exported(tmp_path, the_poses(WorldAxes.UNKNOWN, cam_from_world))
     np.testing.assert_array_equal(vertices(path), the_cloud().points_in_world)
 
 

@@ -120,8 +120,7 @@ def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up: Sequence[fl
     assert up_of({"up": up}).tolist() == [0, -1, 0]
 
 
-def test_north_is_shown_where_the_levelled_frame_says_it(tiny: TinyCapture) -> None:
-    """The words are those of poses.level: who changes them learns it here."""
+def test_north_is_shown_where_poses_level_has_found_it(tiny: TinyCapture) -> None:
     poses = tiny.whole(Poses)
     up = {name: tuple(-rotation[:, 1]) for name, rotation in zip(tiny.names, poses.rotations, strict=True)}
     forward = poses.rotations[:, 2]
@@ -129,10 +128,10 @@ def test_north_is_shown_where_the_levelled_frame_says_it(tiny: TinyCapture) -> N
     for known, north in ((headings, True), ({}, False)):
         level, _ = level_poses(poses, up, known)
         above, side = camera_maps(
-            {"registered": list(level.names), "centers": level.centers.tolist(), "frame": level.frame, "up": [1, 0, 0]}
+            {"registered": list(level.names), "centers": level.centers.tolist(), "axes": level.axes, "up": [1, 0, 0]}
         )
         assert (above.north, side.north) == (north, False)
-        assert up_of({"frame": level.frame, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
+        assert up_of({"axes": level.axes, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
 
 
 def test_labels_stand_beside_their_cameras_and_cover_no_other() -> None:

@@ -156,6 +156,8 @@ POSES = [
     "frame",
     "scale",
     "metric",
+    "axes",
+    "origin_lla",
     "up",
     "groups",
     "links",

@@ -12,6 +12,7 @@ from pano_mvs.core.errors import ChangedFileError, ContractError, InputError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Files, GlobalDescriptor, Pairs, PointCloud, Pose, Poses, RangeMap, TwoView, Views
 from pano_mvs.scene.files import FaceFiles, group_file, item_stems
+from pano_mvs.scene.poses import World
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
 from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 from pano_mvs.scene.two_view import pair_from_name, pair_name
@@ -293,7 +294,7 @@ def test_poses_explode_into_the_poses_of_their_images() -> None:
     empty = Poses.without_points({}, frame="f", scale="s", metric=True, rejected={"a": "blurred"})
     empty.check()
     assert empty.rejected == {"a": "blurred"}
-    assert empty.worlds == (("f", "s", True),)
+    assert empty.worlds == (World("f", "s", metric=True),)
 
 
 @dataclass(frozen=True, eq=False)

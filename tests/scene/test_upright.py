@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
+from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.scene.upright import (
     WORLD_UP,
     mean_up_direction,
-    states_y_down,
     world_up,
     y_up_from_world,
     z_up_from_world,
 )
 
-LEVELLED = "origin at the first registered camera; y down along gravity, by the cameras; z as before"
 
-
-def poses_with(rotations: list[np.ndarray], *, frame: str = "the first registered camera") -> Poses:
+def poses_with(
+    rotations: list[np.ndarray], *, frame: str = "the first registered camera", axes: WorldAxes = WorldAxes.UNKNOWN
+) -> Poses:
     cameras = {f"{idx}.jpg": Rigid3(rotation, np.zeros(3)) for idx, rotation in enumerate(rotations)}
-    return Poses.without_points(cameras, frame=frame, scale="", metric=False)
+    return Poses.without_points(cameras, frame=frame, scale="", metric=False, axes=axes)
 
 
 def cam_from_world_with_up(up: list[float]) -> np.ndarray:
@@ -75,9 +78,28 @@ def test_the_mean_of_the_cameras_counts_far_from_all_axes() -> None:
 
 def test_a_levelled_world_does_not_ask_the_cameras() -> None:
     sideways = [cam_from_world_with_up([1, 0, 0])]
-    assert world_up(poses_with(sideways, frame=LEVELLED)).tolist() == [0, -1, 0]
-    assert states_y_down(LEVELLED)
-    assert not states_y_down("the first registered camera")
+    assert world_up(poses_with(sideways, axes=WorldAxes.LEVEL)).tolist() == [0, -1, 0]
+
+
+def test_words_do_not_level_a_world() -> None:
+    """A frame "camera axes: x right, y down" of a plugin or of a file was taken for a world levelled by gravity."""
+    sideways = [cam_from_world_with_up([1, 0, 0])]
+    for frame in ("camera axes: x right, y down, z forward", "the world of y down.json"):
+        assert world_up(poses_with(sideways, frame=frame)).tolist() == [1, 0, 0]
+
+
+def test_what_is_known_of_a_world_is_stored() -> None:
+    pair = [np.eye(3), np.eye(3)]
+    placed = replace(poses_with(pair, axes=WorldAxes.NORTH), origin_lla=(47.5, 8.25, 410.0))
+    other = poses_with(pair, axes=WorldAxes.LEVEL)
+    other = replace(other, names=("2.jpg", "3.jpg"))
+    parts = dict(join_groups([placed, other]).to_parts())
+    again = Poses.from_parts(parts | {"meta": json.loads(json.dumps(parts["meta"]))})
+    assert [(world.axes, world.origin_lla) for world in again.worlds] == [
+        (WorldAxes.NORTH, (47.5, 8.25, 410.0)),
+        (WorldAxes.LEVEL, None),
+    ]
+    assert [group.axes for group in split_groups(again)] == [WorldAxes.NORTH, WorldAxes.LEVEL]
 
 
 def test_without_agreement_y_points_down() -> None:

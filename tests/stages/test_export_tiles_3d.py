@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pano_mvs.api import Context, Poses
+from pano_mvs.api import Context, Poses, WorldAxes
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import Tiles3dParams, tiles_3d
@@ -36,8 +36,8 @@ def a_cloud(count: int = COUNT) -> PointCloud:
     return PointCloud(points.astype(np.float32), normals.astype(np.float32), colors, np.full(count, 3, np.uint8))
 
 
-def the_poses(frame: str = "the first registered camera") -> Poses:
-    return Poses.without_points({"a.jpg": Rigid3.identity()}, frame=frame, scale="", metric=True)
+def the_poses() -> Poses:
+    return Poses.without_points({"a.jpg": Rigid3.identity()}, frame="", scale="", metric=True)
 
 
 def written(folder: Path, cloud: PointCloud, poses: Poses | None, **settings: object) -> Path:
@@ -120,21 +120,22 @@ def test_boxes_hold_what_is_below_them_and_errors_shrink(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("lla", "expected"),
     [
-        ("0.0000000°, 0.0000000°, 0.0 m", (6378137.0 + 3, 10.0, 20.0)),
-        ("0.0000000°, 90.0000000°, 5.0 m", (-10.0, 6378137.0 + 8, 20.0)),
-        ("90.0000000°, 0.0000000°, 0.0 m", (-20.0, 10.0, 6356752.314245 + 3)),
+        ((0.0, 0.0, 0.0), (6378137.0 + 3, 10.0, 20.0)),
+        ((0.0, 90.0, 5.0), (-10.0, 6378137.0 + 8, 20.0)),
+        ((90.0, 0.0, 0.0), (-20.0, 10.0, 6356752.314245 + 3)),
     ],
 )
-def test_gps_puts_the_tiles_on_the_earth(tmp_path: Path, lla: str, expected: tuple[float, float, float]) -> None:
+def test_gps_puts_the_tiles_on_the_earth(
+    tmp_path: Path, lla: tuple[float, float, float], expected: tuple[float, float, float]
+) -> None:
     """10 m east, 20 m north and 3 m up of the origin, in WGS 84's Earth-centred, Earth-fixed coordinates."""
-    frame = f"x east, y down, z north, by GPS; origin at the first registered camera ({lla})"
     cloud = PointCloud(
         np.array([[10, -3, 20]] * 2, np.float32),
         np.array([[0, -1, 0]] * 2, np.float32),
         np.zeros((2, 3), np.uint8),
         np.ones(2, np.uint8),
     )
-    folder = written(tmp_path, cloud, the_poses(frame))
+    folder = written(tmp_path, cloud, replace(the_poses(), axes=WorldAxes.NORTH, origin_lla=lla))
     root = json.loads((folder / "tileset.json").read_text())["root"]
     transform = np.array(root["transform"]).reshape(4, 4).T  # by columns, as the specification says
     np.testing.assert_allclose(content(folder, root, transform)[0], [expected] * 2, atol=1e-5)

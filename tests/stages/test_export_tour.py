@@ -14,7 +14,7 @@ import PIL.Image
 import pytest
 
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
-from pano_mvs.api import Context, Pose, Poses, RangeMap
+from pano_mvs.api import Context, Pose, Poses, RangeMap, WorldAxes
 from pano_mvs.geometry import Rigid3, ray_from_pixel, ray_grid, rotate_panorama, rotation_from_rotvec
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.metadata import find_gpano, read_container
@@ -27,11 +27,10 @@ from tests.stored import read_picture
 
 SIZE_HW = (96, 192)
 CAPTURE = tiny_capture(Variant(SIZE_HW))
-NORTH = "x east, y down, z north, by 3 compass headings (median disagreement 1.0°)"
 
 
-def poses_of(frame: str = NORTH) -> Poses:
-    return replace(CAPTURE.whole(Poses), frame=frame)
+def poses_of(axes: WorldAxes = WorldAxes.NORTH) -> Poses:
+    return replace(CAPTURE.whole(Poses), axes=axes)
 
 
 def exported(folder: Path, poses: Poses, idx: int = 0, **settings: object) -> LevelPanorama:
@@ -101,7 +100,7 @@ def test_the_written_folder_is_a_capture(tmp_path: Path) -> None:
 
 
 def test_what_is_not_known_is_not_stated(tmp_path: Path) -> None:
-    made = exported(tmp_path, poses_of("the room's"))
+    made = exported(tmp_path, poses_of(WorldAxes.UNKNOWN))
     assert made.heading_deg is None
     gpano, _ = find_gpano(read_container(made.files["panoramas/{item}.jpg"].read_bytes()).xmp)
     assert gpano is not None
@@ -123,7 +122,9 @@ def test_directions_that_are_vertical_are_replaced(facing: Facing) -> None:
     """A camera that looks straight down, and the next one straight above it."""
     down = rotation_from_rotvec(np.array([np.pi / 2, 0, 0]))
     cameras = {"a": Rigid3.from_center(down, [0, 0, 0]), "b": Rigid3.from_center(down, [0, -1, 0])}
-    turns = level_from_world(Poses.without_points(cameras, frame=NORTH, scale="", metric=False), facing)
+    turns = level_from_world(
+        Poses.without_points(cameras, frame="", scale="", metric=False, axes=WorldAxes.NORTH), facing
+    )
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12)
     assert np.linalg.det(turns) == pytest.approx(1)
 

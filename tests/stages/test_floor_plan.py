@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from ezdxf.filemanagement import readfile
 
-from pano_mvs.api import Context, Files, PointCloud, Poses, RangeMap
+from pano_mvs.api import Context, Files, PointCloud, Poses, RangeMap, WorldAxes
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.stages.exports.floor_plan import FloorPlanParams, floor_plan
@@ -21,7 +21,6 @@ from tests.algorithms.floor_plan_rooms import RoomCloud, distance_to, flat_range
 from tests.stored import read_picture
 
 WORLD_FROM_Z_UP = z_up_from_world().T
-LEVEL = "y down along gravity"
 STAIRS = ((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0))
 SVG_LINE = re.compile(r'<line x1="([-.\d]+)" y1="([-.\d]+)" x2="([-.\d]+)" y2="([-.\d]+)"/>')
 
@@ -43,7 +42,7 @@ def the_poses(*centers: tuple[float, float, float], metric: bool = True) -> Pose
     for idx, center in enumerate(centers):
         rotation = rotation_from_rotvec([0, 0.5 * idx, 0])
         cameras[f"{idx}.jpg"] = Rigid3(rotation, -rotation @ WORLD_FROM_Z_UP @ np.array(center))
-    return Poses.without_points(cameras, frame=LEVEL, scale="", metric=metric)
+    return Poses.without_points(cameras, frame="", scale="", metric=metric, axes=WorldAxes.LEVEL)
 
 
 def planned(
@@ -159,7 +158,7 @@ def test_groups_have_a_plan_each_and_too_few_points_none(tmp_path: Path) -> None
         *(getattr(large, name)[:50] for name in ("points_in_world", "normals_in_world", "colors_rgb", "view_counts"))
     )
     cameras = {f"{idx}.jpg": Rigid3(np.eye(3), np.array([-2.0 - idx, 1.5, -2.0])) for idx in range(5)}
-    one = Poses.without_points(cameras, frame=LEVEL, scale="", metric=True)
+    one = Poses.without_points(cameras, frame="", scale="", metric=True, axes=WorldAxes.LEVEL)
     both = Poses(**{**vars(one), "group_idx": np.array([0, 0, 0, 1, 1], np.int32), "other_worlds": (("b", "", False),)})
     files, ctx = planned(tmp_path, PointCloud.of_groups([large, few]), both, formats=("svg",))
     assert set(files.files) == {"floor_plan/floor_plan.json", "floor_plan/storey_0.svg"}

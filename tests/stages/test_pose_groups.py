@@ -41,7 +41,7 @@ from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import tracked, vote
-from pano_mvs.stages.poses import known_poses
+from pano_mvs.stages.poses import known_groups, known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 from tests.stored import write_npz
 
@@ -176,11 +176,33 @@ def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     )
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
-    assert known.rejected["b0.png"].startswith(
-        "out has it in group 1, which has a different frame: use the model sparse/1"
-    )
+    assert known.rejected["b0.png"].startswith("out has it in another group, which has a different frame")
     assert known.rejected["new.png"] == "out has no pose for it"
     assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
+    both = known_groups(out, (*_ORDER, "new.png"), [])
+    assert [set(group.names) for group in split_groups(both)] == [set(_LARGE), set(_SMALL)]
+    assert both.rejected == {"new.png": "out has no pose for it"}
+
+
+def test_groups_and_photographs_of_a_file_are_not_lost(tmp_path: Path) -> None:
+    """Images of another reconstruction were rejected with "has no pose for it", and a photograph ended the run."""
+    panorama, photograph = {"projection_type": "spherical"}, {"projection_type": "perspective"}
+
+    def shot(x: float, camera: str = "p") -> dict[str, object]:
+        return {"rotation": [0, 0, 0], "translation": [x, 0, 0], "camera": camera}
+
+    cameras = {"p": panorama, "phone": photograph}
+    first = {f"a{idx}.png": shot(idx) for idx in range(3)} | {"b1.png": shot(1, "phone"), "z.png": shot(2, "phone")}
+    second = {"b0.png": shot(0), "b2.png": shot(2)}
+    same = {"c0.png": shot(1), "c1.png": shot(1)}
+    path = tmp_path / "reconstruction.json"
+    path.write_text(json.dumps([{"cameras": cameras, "shots": shots} for shots in (second, first, same)]))
+    notes: list[str] = []
+    known = known_groups(path, ("a0.png", "a1.png", "a2.png", "b0.png", "b1.png", "b2.png", "c0.png"), notes)
+    assert [group.names for group in split_groups(known)] == [("a0.png", "a1.png", "a2.png"), ("b0.png", "b2.png")]
+    assert known.rejected["b1.png"] == "in reconstruction.json, its camera is perspective, expected spherical"
+    (note,) = notes
+    assert note.endswith("since only panoramas can be: z.png (its camera is perspective, expected spherical)")
 
 
 def _tracked(rooms: Rooms, ctx: Context, count: int = 100) -> TrackedPoints:
@@ -379,11 +401,26 @@ def test_gps_scales_every_room_with_positions_enough(rooms: Rooms, ctx: Context)
     """The small room has two positions, which are too few."""
     poses = _scaled(rooms, ctx, gps=True, gps_noise_m=0.001, vertical="sensors")
     assert [world.metric for world in poses.worlds] == [True, False]
-    assert "group 1: keeps its own unit of length (its own): GPS gives no scale: 2 of 2 registered" in ctx.notes[1]
+    assert "group 1: keeps its own unit of length (its own): no scale by GPS: 2 of 2 registered" in ctx.notes[1]
+
+
+def test_a_survey_scales_a_room_by_the_names_in_its_table(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
+    centers = 3 * rooms.poses.centers
+    rows = [
+        f"{name},{x},{z},{-y}" for name, (x, y, z) in zip(rooms.poses.names, centers, strict=True) if "b" not in name
+    ]
+    path = tmp_path / "survey.csv"
+    path.write_text("\n".join(["filename,easting,northing,height", *rows]))
+    poses = _scaled(rooms, ctx, positions=path, gps_noise_m=0.001, vertical="sensors")
+    assert [world.metric for world in poses.worlds] == [True, False]
+    assert _metres(poses, "000.png", "001.png") == pytest.approx(
+        3 * _metres(rooms.poses, "000.png", "001.png"), rel=0.05
+    )
+    assert "no scale by the positions in survey.csv: 0 of 2 registered panoramas have a position" in ctx.notes[1]
 
 
 def test_where_no_room_can_be_scaled_the_largest_says_why(rooms: Rooms, ctx: Context) -> None:
-    with pytest.raises(InputError, match="GPS gives no scale: the GPS positions lie within"):
+    with pytest.raises(InputError, match="no scale by GPS: the positions by GPS lie within"):
         _scaled(rooms, ctx, gps=True, vertical="sensors")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.api import Context, Panorama, Pose, Poses
+from pano_mvs.api import Context, Panorama, Pose, Poses, WorldAxes
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.io.tour_players import MARZIPANO, PANNELLUM
 from pano_mvs.scene import FilePart
@@ -70,8 +70,7 @@ def marked(camera: Rigid3, to_other: ArrayLike) -> NDArray[np.uint8]:
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Export a tour of two tilted panoramas that face along their path, and serve it with the players beside it."""
     folder = tmp_path_factory.mktemp("tour")
-    frame = "x east, y down, z north, by 2 compass headings (median disagreement 1.0°)"
-    poses = Poses.without_points(CAMERAS, frame=frame, scale="", metric=False)
+    poses = Poses.without_points(CAMERAS, frame="", scale="", metric=False, axes=WorldAxes.NORTH)
     images, made = {}, {}
     for name, camera in CAMERAS.items():
         write_png(folder / name, marked(camera, TO_B if name == "a.png" else -TO_B))

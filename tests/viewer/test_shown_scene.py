@@ -136,7 +136,7 @@ def test_up_is_minus_y_in_a_level_world(tmp_path: Path) -> None:
     tilted = open_scene(out)
     assert tilted.up[1] > -0.97
     run = json.loads((out / "run.json").read_text())
-    run["poses"]["frame"] = "origin at the first registered camera; y down along gravity, by the cameras"
+    run["poses"]["axes"] = "level"
     (out / "run.json").write_text(json.dumps(run))
     np.testing.assert_array_equal(open_scene(out).up, UP)
 

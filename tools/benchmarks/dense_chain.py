@@ -24,7 +24,7 @@ from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
-from pano_mvs.scene import Axis, Panorama, PointCloud, Pose, Poses, RangeMap, Record, Views
+from pano_mvs.scene import Axis, Panorama, PointCloud, Pose, Poses, RangeMap, Record, Views, WorldAxes
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.session.session import open_session
 from tools.benchmarks.captures import Capture
@@ -189,7 +189,7 @@ class DenseChain:
 def true_poses(capture: Capture) -> Poses:
     """Return the true poses of a capture, without points; the worlds of all captures with truth have y down."""
     return Poses.without_points(
-        capture.poses, frame="the truth's, y down along gravity", scale="the truth's", metric=True
+        capture.poses, frame="the truth's", scale="the truth's", metric=True, axes=WorldAxes.LEVEL
     )
 
 

@@ -52,9 +52,7 @@ def extend_poses(
             names[idx]: why_no_pair(names[idx], two_views) or reasons.get(idx) or why_nothing(model, idx)
             for idx in sorted(left)
         },
-        frame=known.frame,
-        scale=known.scale,
-        metric=known.metric,
+        **known.worlds[0]._asdict(),
     )
     tracks, members = model.tracks()
     for _ in range(3):

@@ -18,13 +18,12 @@ from pano_mvs.algorithms.views import select_views
 from pano_mvs.scene import Panorama, Poses
 from pano_mvs.scene.pose_groups import split_groups, with_cameras
 from pano_mvs.scene.surfaces import Structure
-from pano_mvs.scene.upright import states_y_down
 
 
 def floors_of_groups(poses: Poses, images: Mapping[str, Panorama], *, rng: np.random.Generator) -> Structure:
     """Return the floors that bound what the views of each group see, and no other planes.
 
-    A group of poses whose frame does not state that y points down along gravity has none.
+    A group of poses whose world is not known to be level has none.
 
     Args:
         poses: of all views.
@@ -36,7 +35,7 @@ def floors_of_groups(poses: Poses, images: Mapping[str, Panorama], *, rng: np.ra
     for number, group in enumerate(split_groups(poses)):
         seen = with_cameras(group, np.array([name in images for name in group.names], np.bool_))
         near = select_views(seen, sources=4).neighbours
-        if near and states_y_down(group.frame):
+        if near and group.axes.is_level:
             planes += _floors_of(seen, near, images, rng=rng)
             groups += [number] * (len(planes) - len(groups))
     return Structure(

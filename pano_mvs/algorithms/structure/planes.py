@@ -26,7 +26,6 @@ from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
-from pano_mvs.scene.upright import states_y_down
 
 _FIT_ROUNDS = 5
 _ALONG_NORMAL = 0.7
@@ -298,7 +297,7 @@ def find_structure(
 ) -> Structure:
     """Find the level and upright planes of a place, and the mirrors on these.
 
-    A group of poses whose frame does not state that y points down along gravity has no planes.
+    A group of poses whose world is not known to be level has no planes.
 
     Args:
         poses: of all views.
@@ -311,7 +310,7 @@ def find_structure(
     planes, groups, mirrors, mirror_groups = [], [], [], []
     for number, group in enumerate(split_groups(poses)):
         named = [(idx, name) for idx, name in enumerate(group.names) if name in range_maps]
-        if not named or not states_y_down(group.frame):
+        if not named or not group.axes.is_level:
             continue
         views = [
             plane_view(range_maps[name], lambda name=name: load(name), group.cam_from_world(idx))  # type: ignore[misc]

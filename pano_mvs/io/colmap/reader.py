@@ -7,12 +7,16 @@ entries as a file states, and aborts the process if a camera lacks parameters.) 
 SphereSfM, a fork of COLMAP, writes panoramas as camera model SPHERE, number 11 with three parameters (f, cx, cy). In
 COLMAP, number 11 is another model with more parameters, so that pycolmap cannot read the files. The camera frame is
 the same as ours.
+
+pycolmap's `panorama_sfm` cuts panoramas into pinhole images pano_camera0/…, pano_camera1/… of a rig without a camera
+for the panorama itself, whose pose follows from the turns of these virtual cameras.
 """
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +26,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
-from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_quat_wxyz
+from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_quat_wxyz, rotation_from_rotvec
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
 from pano_mvs.scene import Poses
@@ -43,6 +47,9 @@ _IMAGE = struct.Struct("<I7dI")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT3D = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
 _TRACK = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
+# The images of pycolmap's `panorama_sfm`, and the pitches of its virtual cameras: overlapping, not overlapping.
+_VIRTUAL = re.compile(r"pano_camera(?P<number>\d{1,3})/(?P<panorama>.+)")
+_PITCHES_DEG = ((0.0,), (-35.0, 0.0, 35.0))
 _SPHERE_ID, _SPHERE_CAMERA = 11, struct.Struct("<IiQQ3d")
 
 
@@ -95,7 +102,7 @@ def read_colmap_model(folder: Path) -> Poses:
     """Return the registered images, points and tracks of a COLMAP model of panoramas, in its own world and unit.
 
     Images of other cameras, such as localised photographs, are left out. From SphereSfM's models, whose cameras are
-    SPHERE, only the poses are read.
+    SPHERE, and from models of the virtual cameras of pycolmap's panorama_sfm, only the poses are read.
 
     Raises:
         InputError: if the model cannot be read, has no EQUIRECTANGULAR camera, or registers no image.
@@ -111,6 +118,9 @@ def read_colmap_model(folder: Path) -> Poses:
     cameras = read_cameras(files[0])
     panoramic = {camera_id for camera_id, camera in cameras.items() if camera.model == "EQUIRECTANGULAR"}
     if cameras and not panoramic:
+        images = list(read_images(files[1]).values())
+        if images and all(_VIRTUAL.fullmatch(image.name) for image in images):
+            return _read_virtual_cameras(images, files[1])
         camera_id, camera = min(cameras.items())
         raise InputError(
             f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models of "
@@ -188,6 +198,61 @@ def _read_sphere_model(folder: Path) -> Poses:
         scale="the unit of the SphereSfM model",
         metric=False,
     )
+
+
+def _read_virtual_cameras(images: Sequence[ModelImage], path: Path) -> Poses:
+    """Return the poses of the panoramas whose virtual cameras a model registers, in its own world and unit."""
+    by_panorama: dict[str, dict[int, Rigid3]] = {}
+    for image in images:
+        match = _VIRTUAL.fullmatch(image.name)
+        assert match is not None
+        by_panorama.setdefault(match["panorama"], {})[int(match["number"])] = image.cam_from_world()
+    count = 1 + max(number for cameras in by_panorama.values() for number in cameras)
+    layouts = [cams_from_pano for pitches_deg in _PITCHES_DEG if len(cams_from_pano := _ring(pitches_deg)) >= count]
+    fitting = (
+        turned for layout in layouts if (turned := _panoramas_of_virtual_cameras(by_panorama, layout)) is not None
+    )
+    # One virtual camera of each panorama fits any arrangement.
+    poses = next(fitting, None) if max(map(len, by_panorama.values())) > 1 else None
+    if poses is None:
+        raise InputError(
+            f"{path}: the images pano_camera0/… are not turned against each other as the virtual cameras of pycolmap's "
+            "panorama_sfm are, or there is one of each panorama only, so the poses of the panoramas are unknown. Give "
+            "the model sparse_equirectangular/0, which its newer versions write beside this one"
+        )
+    return Poses.without_points(
+        dict(sorted(poses.items(), key=lambda item: natural_key(item[0]))),
+        frame="the world of the COLMAP model",
+        scale="the unit of the COLMAP model",
+        metric=False,
+    )
+
+
+def _ring(pitches_deg: Sequence[float]) -> list[NDArray[np.float64]]:
+    """Return cam_from_pano of the virtual cameras: four around at each pitch, by half a step on for those above."""
+    return [
+        rotation_from_rotvec([np.deg2rad(-pitch), 0, 0])
+        @ rotation_from_rotvec([0, -np.deg2rad(yaw + 45 * (pitch > 0)), 0])
+        for pitch in pitches_deg
+        for yaw in (0, 90, 180, 270)
+    ]
+
+
+def _panoramas_of_virtual_cameras(
+    by_panorama: Mapping[str, Mapping[int, Rigid3]], cams_from_pano: Sequence[NDArray[np.float64]]
+) -> dict[str, Rigid3] | None:
+    """Return the poses of panoramas by those of their virtual cameras, or None if these are arranged otherwise."""
+    poses = {}
+    for name, cameras in by_panorama.items():
+        found = [Rigid3(cams_from_pano[number].T, np.zeros(3)) @ camera for number, camera in cameras.items()]
+        poses[name] = found[0]
+        # Cameras of a rig share their centre and are turned exactly; text has twelve digits or so.
+        size = 1 + float(np.abs(found[0].translation).max())
+        for other in found[1:]:
+            same = np.allclose(other.rotation, found[0].rotation, rtol=0, atol=1e-6)
+            if not (same and np.allclose(other.translation, found[0].translation, rtol=0, atol=1e-6 * size)):
+                return None
+    return poses
 
 
 def _pose(image: ModelImage) -> Rigid3:

@@ -115,7 +115,9 @@ def _marzipano(data: Any) -> Iterator[StatedScene]:
     for scene in _objects(_get(data, "scenes")):
         key = _text(scene, "id")
         grids = []
-        for number, level in list(enumerate(_objects(scene.get("levels"))))[: -_MAX_LEVELS - 1 : -1]:
+        # Without sizes, the path of its tiles is known all the same.
+        levels = list(_objects(scene.get("levels"))) or [{}]
+        for number, level in list(enumerate(levels))[: -_MAX_LEVELS - 1 : -1]:
             if not level.get("fallbackOnly"):
                 side = _tiles(_number(level, "size"), _number(level, "tileSize"))
                 grids.append(Grid(side, _expanded(f"tiles/{key}/%l/%s/%y/%x.jpg", level=number, first=0)))
@@ -132,7 +134,7 @@ def _pannellum(config: Any) -> Iterator[StatedScene]:
         if kind == "multires" and isinstance(tiles := scene.get("multiRes"), dict):
             path = _text(tiles, "basePath")
             path = f"{'' if '://' in path else base}{path}{_text(tiles, 'path')}.{_text(tiles, 'extension') or 'jpg'}"
-            finest = int(_number(tiles, "maxLevel"))
+            finest = int(_number(tiles, "maxLevel")) or 1
             for level in range(finest, max(0, finest - _MAX_LEVELS), -1):
                 pixels = _number(tiles, "cubeResolution") / 2 ** (finest - level)
                 side = _tiles(pixels, _number(tiles, "tileResolution") or 512)

@@ -24,6 +24,7 @@ from pano_mvs.io.images.captures import (
     natural_key,
     unstitched_reason,
 )
+from pano_mvs.io.images.names import match_image_names, without_extension
 from pano_mvs.io.images.tour_configurations import FACES, NAMES, Grid, StatedScene, stated_scenes
 
 Tiles: TypeAlias = dict[tuple[str, int, int], Path]
@@ -69,7 +70,7 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
         InputError: if there is no complete scene.
     """
     capture = _Capture(folder, list(files_below(folder, notes)))
-    if scenes := list(_stated(capture, notes)):
+    if scenes := list(_stated(capture, notes, notes)):
         return scenes
     found = _scenes(capture, _TILES)
     if not any(map(_finest, found.values())):
@@ -102,7 +103,7 @@ def is_tour(folder: Path) -> bool:
         return False
     cubes, unreadable = _cubes(capture, _TILES), list[str]()
     if len(cubes) < 2:
-        cubes = [dict(scene.tiles) for scene in _stated(capture, unreadable) if scene.tiles]
+        cubes = [dict(scene.tiles) for scene in _stated(capture, [], unreadable) if scene.tiles]
     by_name = not cubes and bool(unreadable)
     if by_name:
         cubes = _cubes(capture, _TILES + _SIX_FILES)
@@ -136,12 +137,18 @@ class _Capture:
         found = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
         self.pictures = {path.relative_to(folder).as_posix(): path for path in found}
         self._stems = {_stem(name): path for name, path in self.pictures.items()}
+        self._by_last_part = _by_last_part(self.pictures)
         self._cubes: dict[tuple[Path, int], Tiles] = {}
 
     def picture(self, url: str, place: str) -> Path | None:
         """Return the picture with a URL that counts from a folder, possibly in another format, or None."""
         name = normpath(join(place, unquote(url.partition("?")[0]).lstrip("/")))
         return self.pictures.get(name) or self._stems.get(_stem(name))
+
+    def alike(self, url: str) -> Path | None:
+        """Return the picture with the path most similar to a URL's, with the same name, or None."""
+        name = _closest(normpath(unquote(url.partition("?")[0])), self._by_last_part)
+        return None if name is None else self.pictures[name]
 
     def tiles(self, grid: Grid, place: str) -> Tiles:
         """Return the tiles of a cube, or nothing if one is missing, or one stands in two places."""
@@ -165,27 +172,33 @@ def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).name else name
 
 
-def _stated(capture: _Capture, notes: list[str]) -> Iterator[TourScene]:
+def _stated(capture: _Capture, notes: list[str], unreadable: list[str]) -> Iterator[TourScene]:
     """Yield the scenes that the configurations in a folder state; of two with the same pictures, the first one.
 
     Where the paths of its tiles show that a cube exists in a finer resolution than is stated, this one is used.
+    Configurations that cannot be read are added to `unreadable`.
     """
     by_path = _scenes(capture, _TILES)
     cubes = {name: tiles for name, levels in by_path.items() if (tiles := _finest(levels))}
+    by_last_part = _by_last_part(cubes)
     cube_of = {path: name for name in cubes for tiles in by_path[name].values() for path in tiles.values()}
     scenes, taken, missing = list[tuple[Path, StatedScene, Tiles, Path | None]](), set[Path](), list[str]()
+    elsewhere = list[str]()
     files = [path for path in capture.files if path.suffix.lower() in {".js", ".json", ".xml", ".html", ".htm"}]
     files.sort(key=lambda path: (len(path.parts), natural_key(path.relative_to(capture.folder).as_posix())))
     for file in files[:200]:
         try:
             stated = stated_scenes(file)
         except (OSError, ValueError) as error:
-            notes.append(f"{file}: not used as the configuration of a tour ({shortened(str(error), 200)})")
+            unreadable.append(f"{file}: not used as the configuration of a tour ({shortened(str(error), 200)})")
             continue
         for scene in stated:
             tiles, panorama = _pictures_of(scene, capture, file)
             finest = cubes.get(cube_of.get(tiles["f", 0, 0], ""), {}) if tiles else {}
             tiles = max(tiles, finest, key=len)
+            if not tiles and panorama is None:
+                tiles, panorama = _alike(scene, capture, file, cubes=cubes, by_last_part=by_last_part)
+                elsewhere += [scene.title or scene.key] if tiles or panorama is not None else []
             pictures = set(tiles.values()) if panorama is None else {panorama}
             if not pictures:
                 missing.append(scene.title or scene.key)
@@ -193,7 +206,17 @@ def _stated(capture: _Capture, notes: list[str]) -> Iterator[TourScene]:
                 taken |= pictures
                 scenes.append((file, scene, tiles, panorama))
     if not scenes:
+        if missing:
+            notes.append(
+                f"titles and links of {len(missing)} scenes are not used, since the paths in their configuration lead "
+                f"to no pictures here: {shortened_list(missing)}"
+            )
         return
+    if elsewhere:
+        notes.append(
+            f"{len(elsewhere)} scenes have other paths or sizes in their configuration, and were found by the names of "
+            f"their folders or files: {shortened_list(elsewhere)}"
+        )
     if missing:
         notes.append(f"{len(missing)} scenes have no complete cube here and are skipped: {shortened_list(missing)}")
     unnamed = {name: tiles for name, tiles in cubes.items() if taken.isdisjoint(tiles.values())}
@@ -222,6 +245,47 @@ def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Til
             return tiles, None
     panoramas = (capture.picture(scene.panorama, place) for place in places if scene.panorama)
     return {}, next((path for path in panoramas if path is not None), None)
+
+
+def _alike(
+    scene: StatedScene,
+    capture: _Capture,
+    file: Path,
+    *,
+    cubes: Mapping[str, Tiles],
+    by_last_part: Mapping[str, list[str]],
+) -> tuple[Tiles, Path | None]:
+    """Return the pictures of a scene whose stated paths do not exist: those with the most similar paths.
+
+    A tour is configured for the place from which it was published, and may state other levels than its tiles have.
+    """
+    place = PurePosixPath(file.relative_to(capture.folder).as_posix()).parent.as_posix()
+    paths = [normpath(join(place, unquote(grid.url("f", 0, 0).partition("?")[0]).lstrip("/"))) for grid in scene.grids]
+    matches = (layout.fullmatch(_stem(path)) for path in paths for layout in _TILES)
+    for stated in dict.fromkeys(match["scene"] for match in matches if match):
+        if found := _closest(stated, by_last_part):
+            return cubes[found], None
+    urls = {face: grid.url(face, 0, 0) for grid in scene.grids if grid.side == 1 for face in FACES}
+    files = {(face, 0, 0): path for face, url in urls.items() if (path := capture.alike(url)) is not None}
+    if len(set(files.values())) == len(FACES):
+        return files, None
+    return {}, capture.alike(scene.panorama) if scene.panorama else None
+
+
+def _by_last_part(names: Iterable[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(_last_part(name), []).append(name)
+    return found
+
+
+def _closest(name: str, by_last_part: Mapping[str, list[str]]) -> str | None:
+    """Return the name that has the same last part and shares most folders, or None if there is none or two do."""
+    return match_image_names([name], by_last_part.get(_last_part(name), [])).get(name)
+
+
+def _last_part(name: str) -> str:
+    return PurePosixPath(without_extension(name)).name.casefold()
 
 
 def _names(scenes: Sequence[StatedScene]) -> list[str]:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
+from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.json_files import (
+    FilePoses,
     posed_views,
     read_json_value,
     require_distinct,
@@ -22,6 +26,8 @@ from pano_mvs.io.poses.json_files import (
 )
 from pano_mvs.io.poses.metashape import read_metashape
 from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
+from pano_mvs.io.poses.positions import NO_POSES, holds_positions, read_positions
+from pano_mvs.io.poses.trajectories import SUFFIXES, match_times, read_trajectory
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
@@ -58,34 +64,56 @@ def read_poses(path: Path) -> Poses:
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
-        with # are ignored.
+        with # are ignored;
+      * a trajectory of the TUM benchmark, .txt or .tum, whose images are called by their times (see `match_images`).
+
+    Cameras of other kinds than panoramas are in `rejected`, with the reason.
 
     Raises:
         InputError: if the file is invalid; it names the file, and the line or the key.
     """
-    path = _file_or_model(path)
+    return _groups_in(_file_or_model(path))[0]
+
+
+def _groups_in(path: Path) -> list[Poses]:
+    """Return the poses in a file or a COLMAP model, those of the largest group first."""
     if is_folder(path):
-        return read_colmap_model(path)
+        return [read_colmap_model(path)]
+    found = _read_file(path)
+    scale = "metres, as the file has it" if found.metric else "the unit of the file"
+    groups = []
+    for number, poses in enumerate(found.groups, start=1):
+        frame = f"the world of {path.name}" + (f", group {number}" if len(found.groups) > 1 else "")
+        others = found.others if number == 1 else {}
+        groups.append(Poses.without_points(poses, rejected=others, frame=frame, scale=scale, metric=found.metric))
+    return groups
+
+
+def _read_file(path: Path) -> FilePoses:
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        return _from_file(read_csv(path), path, metric=False)
+        return FilePoses([read_csv(path)])
     if suffix == ".xml":
-        return _from_file(read_metashape(path), path, metric=False)
-    if suffix not in _JSON:
+        return read_metashape(path)
+    if suffix not in (*_JSON, *SUFFIXES):
         raise InputError(
-            f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml and .csv, not {suffix!r}"
+            f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml, .csv, and .txt or .tum "
+            f"(trajectories), not {suffix!r}"
         )
+    if suffix in SUFFIXES:
+        return FilePoses([read_trajectory(path)])
+    if suffix == ".json" and holds_positions(path):
+        raise InputError(f"{path}: {NO_POSES}")
     value = read_json_value(path)
-    if isinstance(value, list) and value and all(isinstance(item, dict) and "shots" in item for item in value):
-        poses, metric = opensfm_poses(value, path)
-        return _from_file(poses, path, metric=metric)
+    if isinstance(value, list) and all(isinstance(item, dict) and "shots" in item for item in value):
+        return opensfm_poses(value, path)
     data = require_object(value, path)
     for keys, read in _BY_KEYS:
         if keys <= data.keys():
-            return _from_file(read(data, path), path, metric=False)
+            return read(data, path)
     if "views" in data:
         views, metric = posed_views(data, path)
-        return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
+        return FilePoses([{view.name: view.cam_from_world for view in views}], metric=metric)
     raise InputError(
         f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
         "(OpenSfM): no poses here"
@@ -95,18 +123,44 @@ def read_poses(path: Path) -> Poses:
 def read_groups(path: Path) -> list[Poses]:
     """Return the poses in a file or folder, and those of further groups.
 
-    Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given. Each has its
-    own world. Images of an earlier group are omitted.
+    Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given, further
+    reconstructions of OpenSfM and components of Metashape. Each has its own world. Images of an earlier group are
+    omitted.
     """
-    groups = [read_poses(path)]
     model = _file_or_model(path)
+    found = _groups_in(model)
     number = 1
     while model != path and model.name == "0" and is_colmap_model(model.with_name(str(number))):
-        group = read_poses(model.with_name(str(number)))
+        found += _groups_in(model.with_name(str(number)))
+        number += 1
+    groups: list[Poses] = []
+    for group in found:
         known = {name for earlier in groups for name in earlier.names}
         groups.append(with_cameras(group, np.array([name not in known for name in group.names], np.bool_)))
-        number += 1
     return groups
+
+
+def positions_in(path: Path) -> dict[str, FloatArray]:
+    """Return the position (3,) of each image in a file of positions (`read_positions`), or of poses.
+
+    Raises:
+        InputError: if the file is invalid.
+    """
+    if is_file(path) and holds_positions(path):
+        return read_positions(path)
+    poses = read_poses(path)
+    return dict(zip(poses.names, poses.centers, strict=True))
+
+
+def match_images(images: Sequence[str], names: Sequence[str], path: Path) -> tuple[dict[str, str], str]:
+    """Return the name in a file of poses of each image of a capture, and a note on how they were matched, or "".
+
+    Names are compared by `match_image_names`; those of a trajectory are times, see `match_times`.
+    """
+    if path.suffix.lower() not in SUFFIXES or is_folder(path):
+        return match_image_names(images, names), ""
+    matched, how = match_times(images, names, path)
+    return matched, f"the poses in {path.name} belong to the images by {how}"
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:
@@ -130,6 +184,8 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
         rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
     except csv.Error as error:
         raise InputError(f"{path}: not a CSV file ({error})") from error
+    if holds_positions(path):
+        raise InputError(f"{path}: {NO_POSES}")
     if not rows or tuple(rows[0][1]) != CSV_HEADER:
         raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
     poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
@@ -142,7 +198,8 @@ def _file_or_model(path: Path) -> Path:
     if not exists(path):
         raise InputError(
             f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-            "poses.json, a reconstruction.json, a sfm_data.json, a cameras.sfm, an XML file of Metashape or a CSV file"
+            "poses.json, a reconstruction.json, a sfm_data.json, a cameras.sfm, an XML file of Metashape, a CSV file "
+            "or a trajectory (.txt, .tum)"
         )
     if not is_folder(path):
         return path
@@ -156,11 +213,6 @@ def _file_or_model(path: Path) -> Path:
         f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
         f"of {', '.join(_IN_A_FOLDER)}"
     )
-
-
-def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:
-    scale = "metres, as the file has it" if metric else "the unit of the file"
-    return Poses.without_points(poses, frame=f"the world of {path.name}", scale=scale, metric=metric)
 
 
 def _pose_from_row(row: list[str], where: str) -> Rigid3:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,60 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, nearest_rotation
 from pano_mvs.scene import FilePart
+
+
+class FoundCamera(NamedTuple):
+    """A camera with a pose in a file of another program."""
+
+    name: str  # of the image
+    where: str  # file and entry, for messages
+    kind: object  # of the camera, in the words of the file
+    expected: str  # what the file calls the camera of a panorama
+    pose: Callable[[], Rigid3]  # reads cam_from_world; raises InputError
+    group: Hashable = None  # cameras of different groups have worlds of their own
+
+
+@dataclass(frozen=True)
+class FilePoses:
+    """The poses of the panoramas in a file.
+
+    Attributes:
+        groups: cam_from_world by image name; each group has a world of its own, and the largest comes first.
+        others: images that have a pose and cannot be used, with the reason.
+        metric: whether lengths are metres.
+    """
+
+    groups: list[dict[str, Rigid3]]
+    others: dict[str, str] = field(default_factory=dict)
+    metric: bool = False
+
+    @staticmethod
+    def of_cameras(found: Iterable[FoundCamera], path: Path, *, metric: bool = False) -> FilePoses:
+        """Return the poses of cameras that are panoramas; the others are named.
+
+        Raises:
+            InputError: if there is no panorama, or an image is listed twice in a group.
+        """
+        groups: dict[Hashable, list[tuple[str, Rigid3]]] = {}
+        others: dict[str, str] = {}
+        first = ""
+        for camera in found:
+            if camera.kind == camera.expected:
+                groups.setdefault(camera.group, []).append((camera.name, camera.pose()))
+            else:
+                known = f"is {camera.kind}, expected {camera.expected}"
+                others.setdefault(
+                    camera.name, f"its camera {known if camera.kind is not None else 'is not in the file'}"
+                )
+                first = f"{camera.where}: {others[camera.name]}" if len(others) == 1 else first
+        if others and not groups:
+            raise InputError(f"{first}. Only panoramas can be used")
+        ranked = sorted(groups.values(), key=len, reverse=True) or [[]]
+        for group in ranked:
+            require_distinct([name for name, _ in group], path)
+        taken = {name for group in ranked for name, _ in group}
+        others = {name: why for name, why in others.items() if name not in taken}
+        return FilePoses([dict(group) for group in ranked], others, metric)
 
 
 @dataclass(frozen=True)
@@ -74,36 +130,41 @@ def posed_views(data: dict[str, Any], path: Path) -> tuple[list[PosedView], bool
     return views, metric
 
 
-def transforms_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
+def transforms_poses(data: dict[str, Any], path: Path) -> FilePoses:
     """Return the poses in nerfstudio's transforms.json by image name (`panorama`, which we write, or `file_path`).
+
+    Frames whose camera is not EQUIRECTANGULAR are left out, with the reason.
 
     `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's, or
     that of our run if the file states the rotation `file_from_world` (3 × 3) with which our export turned it.
 
     Raises:
-        InputError: if a key is missing or malformed, or a camera is not EQUIRECTANGULAR; it names the file and the key.
+        InputError: if a key is missing or malformed, or no camera is EQUIRECTANGULAR; it names the file and the key.
     """
     frames = data.get("frames")
     if not isinstance(frames, list):
         raise InputError(f"{path}: key 'frames' must be a list of frames, got {type(frames).__name__}")
-    poses: list[tuple[str, Rigid3]] = []
+    found: list[FoundCamera] = []
     turn = number_array(data, "file_from_world", (3, 3), where=str(path)) if "file_from_world" in data else np.eye(3)
     file_from_world = rigid_from_arrays(turn, np.zeros(3), f"{path}: file_from_world")
     for idx, frame in enumerate(frames):
         where = f"{path}: frames[{idx}]"
         name = image_name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
-        require_panorama(frame.get("camera_model", data.get("camera_model")), "EQUIRECTANGULAR", f"{where} ({name})")
-        matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
-        if not np.isfinite(matrix).all():
-            raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
-        if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
-            raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
-        # OpenGL's camera frame is x right, y up, z backwards.
-        rotation = matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-        file_from_cam = rigid_from_arrays(rotation, matrix[:3, 3], f"{where} ({name})")
-        poses.append((name, file_from_cam.inverse() @ file_from_world))
-    require_distinct([name for name, _ in poses], path)
-    return dict(poses)
+        kind = frame.get("camera_model", data.get("camera_model"))
+        pose = partial(_opengl_pose, frame, f"{where} ({name})", file_from_world)
+        found.append(FoundCamera(name, f"{where} ({name})", kind, "EQUIRECTANGULAR", pose))
+    return FilePoses.of_cameras(found, path)
+
+
+def _opengl_pose(frame: dict[str, Any], where: str, file_from_world: Rigid3) -> Rigid3:
+    matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: the pose holds NaN or infinite numbers")
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
+    # OpenGL's camera frame is x right, y up, z backwards.
+    file_from_cam = rigid_from_arrays(matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0]), matrix[:3, 3], where)
+    return file_from_cam.inverse() @ file_from_world
 
 
 def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str) -> Rigid3:
@@ -137,17 +198,16 @@ def require_distinct(names: list[str], path: Path) -> None:
 
 def _posed_view(entry: Any, where: str) -> PosedView:
     name = image_name(entry, "image", where)
+    if "R" not in entry:
+        raise InputError(
+            f"{where} ({name}): key 'R' is missing, and without a rotation there is no pose. A file of positions alone "
+            "has a key 'center' in each view instead of 'R' and 't', and is for pairs.position and poses.scale"
+        )
     pose = rigid_from_arrays(
         number_array(entry, "R", (3, 3), where=where), number_array(entry, "t", (3,), where=where), f"{where} ({name})"
     )
     number, digest = entry.get("id"), entry.get("sha256")
     return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
-
-
-def require_panorama(kind: object, expected: str, where: str) -> None:
-    """Raise InputError, beginning with `where`, unless a camera is of the expected kind."""
-    if kind != expected:
-        raise InputError(f"{where}: its camera is {kind}, expected {expected}. Only panoramas can be used")
 
 
 def image_name(entry: Any, key: str, where: str) -> str:

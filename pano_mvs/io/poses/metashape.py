@@ -6,7 +6,9 @@ component is x_in_world = s R x_in_chunk + t. A spherical sensor looks along z i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,19 +18,20 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import xml_root
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.poses.json_files import require_distinct, require_panorama, rigid_from_arrays
+from pano_mvs.io.poses.json_files import FilePoses, FoundCamera, rigid_from_arrays
 from pano_mvs.scene import FilePart, Poses
 
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 
 
-def read_metashape(path: Path) -> dict[str, Rigid3]:
-    """Return the poses of the aligned cameras, by label, in the world of their component.
+def read_metashape(path: Path) -> FilePoses:
+    """Return the poses of the aligned spherical cameras, by label, in the world of their component.
 
-    Of several components, the one with the most cameras is returned, because each may have a world of its own.
+    Each component is a group of poses. A label that cameras of several groups in Metashape's list have is preceded by
+    the label of its group, as by a folder.
 
     Raises:
-        InputError: if the file is not such a file, or a camera is not spherical; it names the camera.
+        InputError: if the file is not such a file, or no camera is spherical; it names the camera.
     """
     root = _parsed(path)
     chunk = root if root.tag == "chunk" else root.find("chunk")
@@ -36,21 +39,37 @@ def read_metashape(path: Path) -> dict[str, Rigid3]:
         raise InputError(f"{path}: has no element 'chunk'. Export the cameras of Metashape as XML")
     sensors = {sensor.get("id"): sensor.get("type", "frame") for sensor in chunk.iterfind("sensors/sensor")}
     worlds = {component.get("id"): component.find("transform") for component in chunk.iterfind("components/component")}
-    groups: dict[str | None, list[tuple[str, Rigid3]]] = {}
-    for camera in chunk.iterfind("cameras//camera"):
-        label, transform = camera.get("label") or "", camera.find("transform")
-        if transform is None or camera.get("enabled", "true") in ("false", "0"):
-            continue
-        where = f"{path}: camera {label!r}"
-        require_panorama(sensors.get(camera.get("sensor_id")), "spherical", where)
-        matrix = _numbers(transform.text, (4, 4), where)
-        chunk_from_cam = rigid_from_arrays(matrix[:3, :3], matrix[:3, 3], where)
-        component = camera.get("component_id")
-        world_from_chunk = _similarity(worlds.get(component), f"{path}: component {component}")
-        groups.setdefault(component, []).append((label, world_from_chunk.move_camera(chunk_from_cam.inverse())))
-    largest = max(groups.values(), key=len, default=[])
-    require_distinct([name for name, _ in largest], path)
-    return dict(largest)
+    found = []
+    for name, camera in _aligned(chunk):
+        where, component = f"{path}: camera {name!r}", camera.get("component_id")
+        world, world_where = worlds.get(component), f"{path}: component {component}"
+        pose = partial(_pose, camera, where, component=world, component_where=world_where)
+        found.append(FoundCamera(name, where, sensors.get(camera.get("sensor_id")), "spherical", pose, component))
+    return FilePoses.of_cameras(found, path)
+
+
+def _aligned(chunk: ElementTree.Element) -> list[tuple[str, ElementTree.Element]]:
+    """Return the names and elements of the enabled cameras that have a pose."""
+    found = [("", camera) for camera in chunk.iterfind("cameras/camera")]
+    for group in chunk.iterfind("cameras/group"):
+        found += [(group.get("label") or "", camera) for camera in group.iterfind(".//camera")]
+    aligned = [
+        (group, camera.get("label") or "", camera)
+        for group, camera in found
+        if camera.find("transform") is not None and camera.get("enabled", "true") not in ("false", "0")
+    ]
+    groups_of = Counter(label for label, _ in {(label, group) for group, label, _ in aligned})
+    return [
+        (f"{group}/{label}" if groups_of[label] > 1 and group else label, camera) for group, label, camera in aligned
+    ]
+
+
+def _pose(
+    camera: ElementTree.Element, where: str, *, component: ElementTree.Element | None, component_where: str
+) -> Rigid3:
+    matrix = _numbers(camera.findtext("transform"), (4, 4), where)
+    chunk_from_cam = rigid_from_arrays(matrix[:3, :3], matrix[:3, 3], where)
+    return _similarity(component, component_where).move_camera(chunk_from_cam.inverse())
 
 
 def _parsed(path: Path) -> ElementTree.Element:

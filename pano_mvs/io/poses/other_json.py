@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 from typing import Any
@@ -18,10 +19,10 @@ import numpy as np
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, pixel_from_ray, rotation_from_rotvec
 from pano_mvs.io.poses.json_files import (
+    FilePoses,
+    FoundCamera,
     image_name,
     number_array,
-    require_distinct,
-    require_panorama,
     rigid_from_arrays,
 )
 from pano_mvs.scene.poses import Poses
@@ -30,16 +31,15 @@ _SPHERICAL = "spherical"
 _NEW, _PLAIN = 1 << 31, 1 << 30  # of cereal: the first mention of a pointer or class; an object of the base class
 
 
-def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
-    """Return the poses of all views that have one, by image name.
+def openmvg_poses(data: dict[str, Any], path: Path) -> FilePoses:
+    """Return the poses of all views with a spherical camera that have one, by image name.
 
     Raises:
-        InputError: if a value is invalid, or a camera is not spherical; it names the view or the pose.
+        InputError: if a value is invalid, or no camera is spherical; it names the view or the pose.
     """
     cameras = _by_key(data, "intrinsics", path)
     extrinsics = _by_key(data, "extrinsics", path)
-    names: list[str] = []
-    poses: dict[str, Rigid3] = {}
+    found: list[FoundCamera] = []
     # Views that share a camera class name it once and refer to it by number afterwards.
     kinds = {
         str(one.get("polymorphic_id")): one["polymorphic_name"] for one in cameras.values() if "polymorphic_name" in one
@@ -54,12 +54,11 @@ def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         camera = cameras.get(str(about.get("id_intrinsic")), {})
         number = camera.get("polymorphic_id")
         kind = camera.get("polymorphic_name", kinds.get(str(number | _NEW) if isinstance(number, int) else ""))
-        require_panorama(kind, _SPHERICAL, f"{where} ({name})")
         folder = str(about.get("local_path") or "").replace("\\", "/").strip("/")
-        names.append(f"{folder}/{name}" if folder else name)
-        poses[names[-1]] = _pose(pose, f"{path}: pose {about['id_pose']} ({name})")
-    require_distinct(names, path)
-    return poses
+        read = partial(_pose, pose, f"{path}: pose {about['id_pose']} ({name})")
+        full_name = f"{folder}/{name}" if folder else name
+        found.append(FoundCamera(full_name, f"{where} ({name})", kind, _SPHERICAL, read))
+    return FilePoses.of_cameras(found, path)
 
 
 def _by_key(data: dict[str, Any], section: str, path: Path) -> dict[str, dict[str, Any]]:
@@ -146,15 +145,15 @@ def _pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
     return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
 
 
-def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
-    """Return the poses of all views that have one, by image path below the folder that all images share.
+def alicevision_poses(data: dict[str, Any], path: Path) -> FilePoses:
+    """Return the poses of all panoramas that have one, by image path below the folder that they share.
 
     Raises:
-        InputError: if a value is invalid, or a camera is not equirectangular; it names the view or the pose.
+        InputError: if a value is invalid, or no camera is equirectangular; it names the view or the pose.
     """
     cameras = {str(entry.get("intrinsicId")): entry for entry in _entries(data, "intrinsics", path)}
     placed = {str(entry.get("poseId")): entry.get("pose") for entry in _entries(data, "poses", path)}
-    found: list[tuple[str, Rigid3]] = []
+    found: list[FoundCamera] = []
     for view in _entries(data, "views", path):
         if (pose := placed.get(str(view.get("poseId")))) is None:
             continue
@@ -162,15 +161,16 @@ def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         file = image_name(view, "path", where)
         in_rig = str(view.get("rigId", "-1")) not in {"-1", str((1 << 32) - 1)}  # in newer and older files
         kind = "part of a rig" if in_rig else cameras.get(str(view.get("intrinsicId")), {}).get("type")
-        require_panorama(kind, "equirectangular", f"{where} ({file})")
-        found.append((file, _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
-    require_distinct([name for name, _ in found], path)
-    files = [PurePosixPath(name) for name, _ in found]
+        read = partial(_alicevision_pose, pose, f"{path}: pose {view['poseId']} ({file})")
+        found.append(FoundCamera(file, f"{where} ({file})", kind, "equirectangular", read))
+    whole = FilePoses.of_cameras(found, path)
+    (poses,) = whole.groups
+    files = [PurePosixPath(name) for name in poses]
     mixed = len({file.is_absolute() for file in files}) > 1
     shared = PurePosixPath("" if mixed else commonpath([str(file.parent) for file in files]))
     # Of a share on a network, the shared folder has one slash in front instead of two, and as many parts.
     below = (str(PurePosixPath(*file.parts[len(shared.parts) :])) for file in files)
-    return {name: pose for name, (_, pose) in zip(below, found, strict=True)}
+    return FilePoses([dict(zip(below, poses.values(), strict=True))], whole.others)
 
 
 def _entries(data: dict[str, Any], section: str, path: Path) -> list[dict[str, Any]]:
@@ -189,33 +189,43 @@ def _alicevision_pose(value: Any, where: str) -> Rigid3:
     return Rigid3.from_center(rigid_from_arrays(by_columns.T, center, where).rotation, center)
 
 
-def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rigid3], bool]:
-    """Return the poses of the reconstruction with the most shots, by image name, and whether lengths are metres.
+def opensfm_poses(data: list[dict[str, Any]], path: Path) -> FilePoses:
+    """Return the poses of each reconstruction with a spherical camera, by image name.
 
     The world is east, north, up in metres about `reference_lla`. Without GPS positions, OpenSfM writes a reference at
     latitude and longitude 0, and the unit of length is arbitrary.
 
     Raises:
-        InputError: if a value is invalid; it names the shot and the key.
+        InputError: if a value is invalid, or no camera is spherical; it names the shot and the key.
     """
+    if not data:
+        raise InputError(
+            f"{path}: an empty list of reconstructions: OpenSfM reconstructed nothing. Its log says why; the panoramas "
+            "need more overlap, or presets of pano-mvs that find the poses by themselves"
+        )
     for item in data:
         if not isinstance(item.get("cameras"), dict) or not isinstance(item["shots"], dict):
             raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
-    largest = max(data, key=lambda item: len(item["shots"]))
-    cameras, shots = largest["cameras"], largest["shots"]
-    poses = {name: _opensfm_pose(shot, cameras, f"{path}: shot {name!r}") for name, shot in shots.items()}
-    require_distinct(list(poses), path)
-    reference = largest.get("reference_lla")
-    somewhere = isinstance(reference, dict) and bool(reference.get("latitude") or reference.get("longitude"))
-    return poses, somewhere
+    references = [item.get("reference_lla") for item in data]
+    found = []
+    for number, item in enumerate(data):
+        for name, shot in item["shots"].items():
+            where = f"{path}: shot {name!r}"
+            kind = _opensfm_kind(shot, item["cameras"], where)
+            found.append(FoundCamera(name, where, kind, _SPHERICAL, partial(_opensfm_pose, shot, where), number))
+    metric = all(isinstance(one, dict) and bool(one.get("latitude") or one.get("longitude")) for one in references)
+    return FilePoses.of_cameras(found, path, metric=metric)
 
 
-def _opensfm_pose(shot: Any, cameras: dict[str, Any], where: str) -> Rigid3:
+def _opensfm_kind(shot: Any, cameras: dict[str, Any], where: str) -> object:
     if not isinstance(shot, dict):
         raise InputError(f"{where}: expected an object, got {type(shot).__name__}")
     camera = cameras.get(str(shot.get("camera", "")))
-    projection = camera.get("projection_type") if isinstance(camera, dict) else None
-    require_panorama("spherical" if projection == "equirectangular" else projection, "spherical", where)
+    kind = camera.get("projection_type") if isinstance(camera, dict) else None
+    return _SPHERICAL if kind == "equirectangular" else kind
+
+
+def _opensfm_pose(shot: dict[str, Any], where: str) -> Rigid3:
     rotvec, translation = (number_array(shot, key, (3,), where=where) for key in ("rotation", "translation"))
     if not np.isfinite(rotvec).all():
         raise InputError(f"{where}: key 'rotation' holds NaN or infinite numbers")

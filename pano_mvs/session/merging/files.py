@@ -128,6 +128,8 @@ def _loaded(out: Path, cache: Path | None) -> Block:
             frame=run.summary.poses.frame or largest.frame,
             scale=run.summary.poses.scale or largest.scale,
             metric=run.summary.poses.metric,
+            axes=run.summary.poses.axes,
+            origin_lla=run.summary.poses.origin_lla,
             doubts={name: run.summary.poses.doubts[name] for name in largest.names if name in run.summary.poses.doubts},
         )
     return Block(run, largest, tuple(name for group in others for name in group.names))

@@ -24,7 +24,6 @@ from pano_mvs.api import (
     Poses,
     RangeMap,
     chunks,
-    origin_of_frame,
     params_from,
     settings_from,
     stage,
@@ -174,7 +173,7 @@ def tiles_3d(cloud: One[PointCloud], poses: One[Poses] | None, params: Tiles3dPa
             writer.add(node.name, node.chosen, node.size)
         metric = placed is not None and placed.metric
         about = {"unit": "metre" if metric else "scene unit", "file_from_world": turn.tolist()}
-        writer.finish(about, None if placed is None else origin_of_frame(placed.frame))
+        writer.finish(about, None if placed is None else placed.origin_lla)
         files |= {f"{folder}/{name}": path for name, path in writer.files.items()}
         if not number:
             ctx.metric("tiles", len(nodes))

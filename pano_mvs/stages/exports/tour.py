@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
-from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, Pose, Poses, RangeMap, stage
+from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, Pose, Poses, RangeMap, WorldAxes, stage
 from pano_mvs.io.colmap.workspace import write_picture
 from pano_mvs.io.images.metadata import add_level_gpano
 from pano_mvs.io.ranges import write_range_tiff
@@ -29,7 +29,6 @@ from pano_mvs.io.tour_players import (
 )
 from pano_mvs.scene.files import LevelPanorama, group_file, item_stems
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.upright import states_y_down, states_z_north
 
 _FOLDER = "panoramas"
 Player = Literal["pannellum", "marzipano", "krpano"]
@@ -77,8 +76,9 @@ def panoramas(
     picture, size_hw = f"{_FOLDER}/{{item}}.{params.format}", image.size_hw
     files = {picture: ctx.scratch / f"panorama.{params.format}"}
     write_picture(files[picture], np.asarray(turned_panorama(image.load(), turn), np.uint8))
-    heading = float(np.rad2deg(np.arctan2(to_level[2, 0], to_level[2, 2]))) if states_z_north(group.frame) else None
-    add_level_gpano(files[picture], size_hw, heading_deg=heading, level=states_y_down(group.frame))
+    is_north = group.axes is WorldAxes.NORTH
+    heading = float(np.rad2deg(np.arctan2(to_level[2, 0], to_level[2, 2]))) if is_north else None
+    add_level_gpano(files[picture], size_hw, heading_deg=heading, level=group.axes.is_level)
     if range_map is not None and params.ranges:
         valid = range_map.valid & image.load_mask()
         ranges = turned_panorama(

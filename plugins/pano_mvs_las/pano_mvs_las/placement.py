@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import Poses, UsageError, lla_from_local, origin_of_frame, world_up, z_up_from_world
+from pano_mvs.api import Poses, UsageError, lla_from_local, world_up, z_up_from_world
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
@@ -70,7 +70,7 @@ def placement_of(poses: Poses, epsg: int | None) -> Placement:
     Raises:
         UsageError: if a map is asked for and the place is not known, or there is no such map.
     """
-    origin = origin_of_frame(poses.frame)
+    origin = poses.origin_lla
     if epsg == 0 or (origin is None and epsg is None):
         return Placement(origin, file_from_world=z_up_from_world(world_up(poses)))
     if origin is None:

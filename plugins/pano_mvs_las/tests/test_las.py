@@ -10,7 +10,18 @@ import laspy
 import numpy as np
 import pye57
 import pytest
-from pano_mvs.api import Context, InputError, Panorama, Params, PointCloud, Poses, Rigid3, UsageError, ray_from_pixel
+from pano_mvs.api import (
+    Context,
+    InputError,
+    Panorama,
+    Params,
+    PointCloud,
+    Poses,
+    Rigid3,
+    UsageError,
+    WorldAxes,
+    ray_from_pixel,
+)
 from pano_mvs.io import point_selection
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
@@ -20,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from pano_mvs_las import e57, las
 from pano_mvs_las.stages import CloudParams, E57Params, LasParams
 
-HERE = "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
+HERE = (47.5, 8.25, 410.0)
 
 
 def a_cloud(count: int = 1000, *, reach: float = 20.0) -> PointCloud:
@@ -35,8 +46,13 @@ def a_cloud(count: int = 1000, *, reach: float = 20.0) -> PointCloud:
     )
 
 
-def the_poses(frame: str = "the first registered camera") -> Poses:
-    return Poses.without_points({"a.jpg": Rigid3.identity()}, frame=frame, scale="", metric=bool(frame))
+def the_poses(origin_lla: tuple[float, float, float] | None = None) -> Poses:
+    return placed({"a.jpg": Rigid3.identity()}, origin_lla)
+
+
+def placed(cameras: dict[str, Rigid3], origin_lla: tuple[float, float, float] | None) -> Poses:
+    axes = WorldAxes.UNKNOWN if origin_lla is None else WorldAxes.NORTH
+    return Poses.without_points(cameras, frame="", scale="", metric=True, axes=axes, origin_lla=origin_lla)
 
 
 def written(stage: Any, folder: Path, cloud: PointCloud, poses: Poses, params: Params) -> Path:
@@ -199,10 +215,10 @@ def blob(node: Any) -> np.ndarray:
     return np.frombuffer(bytes(data), np.uint8)
 
 
-@pytest.mark.parametrize("frame", ["the room's", HERE], ids=["upright", "on a map"])
+@pytest.mark.parametrize("origin_lla", [None, HERE], ids=["upright", "on a map"])
 @pytest.mark.parametrize("idx", [0, 2])
 def test_points_of_an_e57_file_lie_on_their_pixels_as_the_standard_defines_them(
-    tmp_path: Path, idx: int, frame: str
+    tmp_path: Path, idx: int, origin_lla: tuple[float, float, float] | None
 ) -> None:
     """ASTM E2807-11, 8.4.14.5: x = imageWidth / 2 − θ / pixelWidth, y = imageHeight / 2 − φ / pixelHeight.
 
@@ -210,9 +226,7 @@ def test_points_of_an_e57_file_lie_on_their_pixels_as_the_standard_defines_them(
     to that of the file: x_file = R x_image + t.
     """
     pixels, cloud = in_pictures(idx)
-    poses = Poses.without_points(
-        dict(zip(CAPTURE.names, CAPTURE.poses, strict=True)), frame=frame, scale="", metric=True
-    )
+    poses = placed(dict(zip(CAPTURE.names, CAPTURE.poses, strict=True)), origin_lla)
     ctx = Context(np.random.default_rng(0), tmp_path)
     (path,) = e57(cloud, poses, CAPTURE.images, E57Params(), ctx).files.values()
     points = e57_points(path)
@@ -237,7 +251,7 @@ def test_points_of_an_e57_file_lie_on_their_pixels_as_the_standard_defines_them(
     size_hw = (height, width)
     found = ray_from_pixel(np.stack([x_image, y_image], axis=-1), size_hw)
     # The scale of a map is .9996, but not that of its heights.
-    np.testing.assert_allclose(found, ray_from_pixel(pixels, size_hw), atol=5e-4 if frame == HERE else 1e-6)
+    np.testing.assert_allclose(found, ray_from_pixel(pixels, size_hw), atol=5e-4 if origin_lla else 1e-6)
     colors = np.stack([points[f"color{name}"] for name in ("Red", "Green", "Blue")], axis=-1)
     seen = picture[y_image.astype(int), x_image.astype(int)]
     assert np.abs(seen.astype(int) - colors).mean() < 6  # JPEG; 40 between random pixels

@@ -130,6 +130,18 @@ def test_sensors_level_a_turned_world(pano_mvs: Command, capture: Path, turned: 
     np.testing.assert_allclose(-np.array(told["centers"])[:, 1], np.array(heights) - heights[0], atol=1e-6)
 
 
+def test_pitch_and_roll_that_fit_no_picture_are_named(
+    pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]
+) -> None:
+    for name in turned:
+        write_sensors(capture / "images" / name, np.array([0.2, -0.9, 0.28]) / np.linalg.norm([0.2, -0.9, 0.28]))
+    workflow = capture.parent / "level.yaml"
+    workflow.write_text(KNOWN + "  level: {use: poses.level}\n")
+    assert pano_mvs("run", workflow, "--out", "out").code == 0
+    (note,) = [note for note in run_json(Path("out"))["notes"] if "pitch and roll in the metadata" in note]
+    assert "were not used: the sensors of 4 panoramas disagree by" in note
+
+
 def test_gps_gives_metres_and_the_compass(pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]) -> None:
     """The room as a street: 60 m for each of its units, x to the east and z to the north."""
     for name, pose in turned.items():
@@ -148,7 +160,7 @@ def test_gps_gives_metres_and_the_compass(pano_mvs: Command, capture: Path, turn
     np.testing.assert_allclose(told["centers"], [60 * pose.center for pose in turned.values()], atol=0.01)
     indoors = pano_mvs("run", workflow, "--out", "out", "--set", "metres.gps_noise_m=20")
     assert indoors.code != 0
-    assert "too close for GPS that is good to 20.0 m" in indoors.flat
+    assert "too close for positions that are good to 20.0 m" in indoors.flat
 
 
 def test_what_gives_no_scale_stops_with_the_reason(pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]) -> None:

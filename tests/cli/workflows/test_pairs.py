@@ -76,6 +76,19 @@ def test_pairs_are_bounded_by_themselves_and_the_plan_knows_how_many(pano_mvs: C
     assert next(stage for stage in found if stage["name"] == "matches")["run"] in (3, 4)
 
 
+def test_positions_without_rotations_choose_pairs(pano_mvs: Command, capture: Path) -> None:
+    names = sorted(path.name for path in (capture / "images").iterdir())
+    Path("survey.csv").write_text("\n".join(["name;x;y;z", *(f"{name};{idx};0;0" for idx, name in enumerate(names))]))
+    selector = "position, path: survey.csv, neighbours: 1"
+    text = WORKFLOW.format(images=capture / "images", selector=selector, looks=LOOKS, features="orb_tangent")
+    Path("pairs.yaml").write_text(text)
+    outcome = pano_mvs("run", "pairs.yaml", "--out", "out", "--until", "pairs")
+    assert outcome.code == 0, outcome.text
+    (stage,) = [stage for stage in run_json(Path("out"))["stages"] if stage["name"] == "pairs"]
+    assert stage["metrics"]["located"] == 1
+    assert stage["metrics"]["pairs"] == len(names) - 1
+
+
 def test_known_poses_choose_pairs(pano_mvs: Command, capture: Path) -> None:
     """Poses from a file before the selector are positions, if there are too many images to match all pairs."""
     text = WORKFLOW.format(

@@ -86,8 +86,8 @@ def test_a_formatted_script_is_read(tmp_path: Path) -> None:
         "{ id: 'b', name: 'It\\'s: {here', levels: [], },\n],\n};\nvar more = {};\n"
     )
     assert [(scene.name, scene.links) for scene in scenes_of(tmp_path)] == [
-        ("The old hall", ()),
-        ("b", ()),
+        ("The old hall", ("It's {here",)),
+        ("It's {here", ()),
     ]
 
 
@@ -148,6 +148,78 @@ def test_older_krpano_levels_are_read(tmp_path: Path) -> None:
     )
     (tmp_path / "tour.xml").write_text(f"<krpano>{scenes}</krpano>")
     assert [(scene.name, len(scene.tiles)) for scene in scenes_of(tmp_path)] == [("aaa", 24), ("bbb", 24)]
+
+
+def renamed(folder: Path, program: str, change: Callable[[str], str]) -> None:
+    path = folder / CONFIGURATIONS[program]
+    text = path.read_text()
+    assert change(text) != text
+    path.write_text(change(text))
+
+
+@pytest.mark.parametrize(
+    ("program", "change"),
+    [
+        ("Pannellum", lambda text: text.replace('"./tour"', '"https://example.com/houses/12/tour"')),
+        ("Pannellum", lambda text: text.replace('"./tour"', '"/var/www/houses/12"')),
+        ("Pannellum", lambda text: text.replace('"maxLevel": 2', '"maxLevel": "?"')),
+        ("Marzipano", lambda text: text.replace('{"tileSize": 256, "size": 256, "fallbackOnly": true},', "")),
+        (
+            "Marzipano",
+            lambda text: text.replace(f'"size": {SIDE}}}', '"size": 256}').replace('"size": 32', '"size": 96'),
+        ),
+        ("krpano", lambda text: text.replace("panos/", "https://example.com/house/panos/")),
+    ],
+)
+def test_titles_and_links_survive_other_paths_and_levels(
+    tmp_path: Path, program: str, change: Callable[[str], str]
+) -> None:
+    """The pictures were found by their paths, but titles and links were lost without a word."""
+    write_tour(tmp_path, program, KEYS)
+    write_configuration(tmp_path, program, {"c": "Kitchen", "a": "Hall", "b": "Attic"}, links={"c": ["a", "b"]})
+    if program == "Marzipano":
+        indented = tmp_path / CONFIGURATIONS[program]
+        data = json.loads(indented.read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
+        indented.write_text(f"var APP_DATA = {json.dumps(data)};")
+    renamed(tmp_path, program, change)
+    notes: list[str] = []
+    scenes = list_scenes(tmp_path, notes)
+    assert [(scene.name, scene.links, len(scene.tiles)) for scene in scenes] == [
+        ("Kitchen", ("Hall", "Attic"), 24),
+        ("Hall", (), 24),
+        ("Attic", (), 24),
+    ]
+    assert len(notes) == 1
+    assert "found by the names of their folders" in notes[0]
+
+
+def test_panoramas_and_six_files_are_found_by_their_names(tmp_path: Path) -> None:
+    for key in "ab":
+        write(tmp_path / f"{key}.jpg", np.tile(face_of("f"), (1, 2, 1)))
+        for face in "frblud":
+            write(tmp_path / f"cubes/{key}/{face}.png", face_of(face))
+    base = "https://example.com/tour/"
+    stated: dict[str, dict[str, object]] = {key: {"panorama": f"{base}{key}.jpg", "title": key * 3} for key in "ab"}
+    for key in "ab":
+        files = [f"{base}{key}/{face}.png" for face in "frblud"]
+        stated[f"cube {key}"] = {"type": "cubemap", "cubeMap": files, "hotSpots": [{"sceneId": "a"}]}
+    (tmp_path / "tour.json").write_text(json.dumps({"scenes": stated}))
+    assert [(scene.name, scene.links, len(scene.tiles)) for scene in scenes_of(tmp_path)] == [
+        ("aaa", (), 0),
+        ("bbb", (), 0),
+        ("cube a", ("aaa",), 6),
+        ("cube b", ("aaa",), 6),
+    ]
+
+
+def test_a_configuration_of_another_tour_is_named(tmp_path: Path) -> None:
+    write_tour(tmp_path, "Pannellum", KEYS)
+    write_configuration(tmp_path, "Pannellum", {"x": "Kitchen", "y": "Hall"}, links={"x": ["y"]})
+    notes: list[str] = []
+    assert [scene.name for scene in list_scenes(tmp_path, notes)] == ["a", "b", "c"]
+    (told,) = notes
+    assert told.startswith("titles and links of 2 scenes are not used")
+    assert told.endswith("Kitchen, Hall")
 
 
 WRITERS: dict[str, Callable[[list[Scene]], str]] = {

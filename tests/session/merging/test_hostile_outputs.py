@@ -138,6 +138,7 @@ _BY_WAY_OF_THESE = {
     *(f"io.poses.files.{name}" for name in ("read_poses", "read_groups")),
     *(f"io.colmap.reader.{name}" for name in ("read_cameras", "read_images", "read_points")),
     *("evaluation.inputs.read_truth", "evaluation.inputs.read_cameras"),  # names of poses, matched with those of images
+    *("io.poses.trajectories.read_trajectory", "io.poses.positions.read_positions"),  # likewise; never from an output
 }
 _OTHERS = {  # readers of files that state names, with the test of them; the readers of arrays and pictures state none
     "results.run_output.load": "test_hostile_names_in_run_json_name_no_file",

@@ -26,7 +26,7 @@ from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene import Files, Poses
+from pano_mvs.scene import Files, Poses, WorldAxes
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.session.merging.files import MergeFiles, load_blocks
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
@@ -153,12 +153,24 @@ def test_metres_and_doubts_of_a_block_are_kept_without_its_cache(folder: Path, t
     write_block(tmp_path / "metric", list(range(5, 14)), some_world(9))
     summary = RunSummary.read(tmp_path / "metric")
     stated = summary.poses.model_copy(
-        update={"metric": True, "scale": "by GPS", "frame": "y down", "doubts": {"013.png": "hardly seen"}}
+        update={
+            "metric": True,
+            "scale": "by GPS",
+            "axes": WorldAxes.LEVEL,
+            "origin_lla": (47.5, 8.25, 410.0),
+            "doubts": {"013.png": "hardly seen"},
+        }
     )
     summary.model_copy(update={"poses": stated}).write(tmp_path / "metric")
     result = merge_outputs([folder / "block_0", tmp_path / "metric"], tmp_path / "merged")
     assert result.alignment.reference == 1
-    assert (result.summary.poses.metric, result.summary.poses.scale) == (True, "by GPS")
+    merged = result.summary.poses
+    assert (merged.metric, merged.scale, merged.axes, merged.origin_lla) == (
+        True,
+        "by GPS",
+        WorldAxes.LEVEL,
+        (47.5, 8.25, 410.0),
+    )
     assert set(result.summary.poses.doubts) <= {"013.png"}
     assert read_poses(tmp_path / "merged/poses.json").metric
 

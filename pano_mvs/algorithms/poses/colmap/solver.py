@@ -129,15 +129,13 @@ def extend_with_colmap(
             rejected={
                 name: why_no_pair(name, two_views) or stopped for name, idx in position.items() if idx not in fixed
             },
-            frame=known.frame,
-            scale=known.scale,
-            metric=known.metric,
+            **known.worlds[0]._asdict(),
         )
     names = tuple(features)
     registered = {names[idx] for idx in registered_panoramas(model, images)}
     rejected = _rejected(features, two_views, registered)
     poses = _in_world_of(known, poses_from_model(model, features, images, rejected=rejected))
-    return replace(poses, frame=known.frame, scale=known.scale, metric=known.metric)
+    return replace(poses, **known.worlds[0]._asdict())
 
 
 def _in_world_of(known: Poses, poses: Poses) -> Poses:

@@ -105,7 +105,7 @@ def _unit_translations(poses: Poses) -> Poses:
     return Poses.without_points(
         moved,
         rejected=poses.rejected,
-        frame=poses.frame,
-        scale="every camera is at distance 1 from the first: no scale factors",
-        metric=False,
+        **poses.worlds[0]
+        ._replace(scale="every camera is at distance 1 from the first: no scale factors", metric=False)
+        ._asdict(),
     )

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.poses.frame.upside_down import most_probable_up, upside_down_probability
 from pano_mvs.algorithms.poses.frame.vertical_lines import (
     Picture,
@@ -28,7 +27,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import UP, Similarity3, angle_between, rotation_from_rotvec, rotation_from_two_vectors
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 
@@ -51,6 +50,7 @@ class Vertical:
     # opposite to their up direction.
     upside_down: float = float("nan")
     weights: Mapping[str, float] = field(default_factory=dict)  # of each source of `up_in_world`; their sum is 1
+    unused: str = ""  # why pitch and roll in the metadata were not used; "" if they were, or if there are none
 
     def __bool__(self) -> bool:
         return not self.reason
@@ -72,25 +72,50 @@ def find_vertical(
         evidence: "sensors" of the cameras; vertical "lines" in the pictures, or the "structure" of floors, ceilings and
             tables, within 20° of the cameras' mean up direction; the up directions of the "cameras" alone; or "auto":
             the mean of the most precise of these and of those that agree with it. With "auto", sensors decide which way
-            is up; without them, the vertical is turned around if the capture is upside down (see
-            `pano_mvs.algorithms.poses.frame.upside_down`).
+            is up, unless lines and cameras agree against them; without them, the vertical is turned around if the
+            capture is upside down (see `pano_mvs.algorithms.poses.frame.upside_down`).
     """
-    sensors, cameras = vertical_from_sensors(poses, up_in_cam or {}), vertical_from_cameras(poses)
-    prior = sensors if sensors and evidence in ("auto", "sensors") else cameras
-    finders: dict[str, Callable[[], Vertical]] = {
-        "sensors": lambda: sensors,
-        "lines": lambda: _from_lines(poses, pictures or {}, prior),
-        "structure": lambda: _from_structure(poses, prior),
+    if evidence == "auto":
+        return _from_all(poses, up_in_cam or {}, pictures or {})
+    cameras = vertical_from_cameras(poses)
+    finders: dict[Evidence, Callable[[], Vertical]] = {
+        "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
+        "lines": lambda: _from_lines(poses, pictures or {}, cameras),
+        "structure": lambda: _from_structure(poses, cameras),
         "cameras": lambda: cameras,
     }
-    found = [find() for name, find in finders.items() if evidence in ("auto", name)]
+    found = finders[evidence]()
+    return _mean_of_agreeing([found]) if found else found
+
+
+def _from_all(poses: Poses, up_in_cam: Mapping[str, Sequence[float]], pictures: Mapping[str, Picture]) -> Vertical:
+    """Return the mean of the most precise source and of those that agree with it, with the right sign."""
+    sensors, cameras = vertical_from_sensors(poses, up_in_cam), vertical_from_cameras(poses)
+    prior = sensors or cameras
+    lines = _from_lines(poses, pictures, prior)
+    # Programs that level pictures may leave the pitch and roll of the camera in the metadata. Then the cameras of the
+    # pictures are upright, and their lines say so.
+    if sensors and cameras and not lines:
+        upright = _from_lines(poses, pictures, cameras)
+        if upright and _agrees(upright, cameras):
+            lines, prior = upright, cameras
+    found = [sensors, lines, _from_structure(poses, prior), cameras]
     known = [each for each in found if each and (not prior or each.up_in_world @ prior.up_in_world > 0)]
+    stated = any(name in up_in_cam for name in poses.names)
     if not known:
-        return _unknown("; ".join(dict.fromkeys(each.reason for each in found)))
+        reason = "; ".join(dict.fromkeys(each.reason for each in found))
+        return replace(_unknown(reason), unused=sensors.reason if stated else "")
     vertical = _mean_of_agreeing(known)
-    if sensors or evidence != "auto":
+    if stated and "sensors" not in vertical.weights:
+        off_deg = float(np.rad2deg(angle_between(sensors.up_in_world, vertical.up_in_world)))
+        against = (
+            f"they are {off_deg:.1f}° off {vertical.evidence}. A program that levels pictures may have left them. If "
+            "they are right, set `evidence: sensors` for poses.level"
+        )
+        vertical = replace(vertical, unused=against if sensors else sensors.reason)
+    if prior is sensors:
         return vertical
-    probability = upside_down_probability(poses, pictures or {}, vertical.up_in_world)
+    probability = upside_down_probability(poses, pictures, vertical.up_in_world)
     up = -vertical.up_in_world if probability >= SURE else vertical.up_in_world
     return replace(vertical, up_in_world=up, upside_down=probability)
 
@@ -99,14 +124,18 @@ def _mean_of_agreeing(known: Sequence[Vertical]) -> Vertical:
     """Return the mean, by precision, of the most precise vertical and of those that agree with it."""
     lead = min(known, key=lambda each: each.uncertainty_deg)
     ups = np.array([each.up_in_world for each in known])
-    variances = np.array([each.uncertainty_deg**2 for each in known])
-    # A chi-square test with two degrees of freedom: one in twenty that measure the same is refused.
-    agrees = np.rad2deg(angle_between(ups, lead.up_in_world)) ** 2 <= -np.log(0.05) * (variances + variances.min())
-    weights = agrees / variances
+    weights = np.array([_agrees(each, lead) / each.uncertainty_deg**2 for each in known])
     up = weights @ ups / np.linalg.norm(weights @ ups)
     shares = zip([each.source for each in known], (weights / weights.sum()).tolist(), strict=True)
     named = {source: share for source, share in shares if share}
     return replace(lead, up_in_world=up, weights=named, uncertainty_deg=float(weights.sum() ** -0.5))
+
+
+def _agrees(first: Vertical, second: Vertical) -> bool:
+    """Return whether two verticals may be the same; one in twenty pairs that measure the same is refused."""
+    off_deg = float(np.rad2deg(angle_between(first.up_in_world, second.up_in_world)))
+    # A chi-square test with two degrees of freedom, whose joint standard deviation `uncertainty_deg` is.
+    return off_deg**2 <= -float(np.log(0.05)) * (first.uncertainty_deg**2 + second.uncertainty_deg**2)
 
 
 def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]) -> Vertical:
@@ -316,7 +345,7 @@ def level_poses(
         The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned
         the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
-    if origin_of_frame(poses.frame) is not None:
+    if poses.origin_lla is not None:
         return poses, Vertical(UP, reason="GPS has already turned it: x east, y down, z north")
     vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
     if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
@@ -329,22 +358,22 @@ def level_poses(
         return poses, vertical
     levelling = rotation_from_two_vectors(vertical.up_in_world, UP)
     level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
-    towards, heading = _northward(level, heading_deg or {})
+    axes, towards, heading = _northward(level, heading_deg or {})
     # Adding 0 turns −0 into 0: the first camera is exactly at the origin.
     level = moved_poses(level, Similarity3(1.0, towards, np.zeros(3)))
     level.translations[0] = 0.0
     known = f"{vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°"
     frame = f"origin at the first registered camera; y down along gravity, by {known}; {heading}"
-    return replace(level, frame=frame), vertical
+    return replace(level, frame=frame, axes=axes), vertical
 
 
-def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArray, str]:
-    """Return the rotation about the vertical that makes z point north, and its description."""
+def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[WorldAxes, FloatArray, str]:
+    """Return the axes, the rotation about the vertical that makes z point north if it is known, and its description."""
     headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
     unturned = "z close to where it pointed before levelling"
     # Software that knows no heading writes zero for all images.
     if len(headings) < 2 or not any(heading for _, heading in headings):
-        return np.eye(3), unturned
+        return WorldAxes.LEVEL, np.eye(3), unturned
     forward = np.array([level.rotations[idx][2] for idx, _ in headings])
     measured_rad = np.deg2rad([heading for _, heading in headings])
     turns = np.exp(1j * (measured_rad - np.arctan2(forward[:, 0], forward[:, 2])))
@@ -352,7 +381,8 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     turn_rad = float(np.angle(medoid)) + float(np.median(np.angle(turns / medoid)))
     off_deg = float(np.median(np.abs(np.rad2deg(np.angle(turns * np.exp(-1j * turn_rad))))))
     if off_deg > 15.0:
-        return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
-    return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
+        return WorldAxes.LEVEL, np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
+    heading = (
         f"z north, by {len(headings)} compass {plural(len(headings), 'heading')} (median disagreement {off_deg:.1f}°)"
     )
+    return WorldAxes.NORTH, rotation_from_rotvec([0.0, turn_rad, 0.0]), heading

@@ -114,7 +114,7 @@ def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost
     fixed = () if correct and pairs.compared else [*model.cameras]
     model, checks = correct_cameras(model, capture.confirmation, fixed=fixed, miss_cost=miss_cost)
     if checks.moved or checks.removed:
-        moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
+        moved = replace(poses_of(model), **poses.worlds[0]._asdict())
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     return with_camera_checks(poses, pairs, checks)
 

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, origin_of_frame, scaled_by_gps
+from pano_mvs.algorithms.poses.frame.georeference import fit_gps, fit_survey, georeferenced_poses, scaled_by_gps
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 from tests.algorithms.poses.synthetic_capture import random_rotation
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -94,6 +94,8 @@ def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed: int) -> No
     np.testing.assert_array_equal(world.centers[0], 0)
     np.testing.assert_array_equal(world.point_errors_rad, true.point_errors_rad)
     assert "x east, y down, z north, by GPS" in world.frame
+    assert world.axes is WorldAxes.NORTH
+    assert solved.origin_lla is None
     world.check()
 
 
@@ -114,6 +116,28 @@ def test_exact_positions_give_the_exact_world() -> None:
     np.testing.assert_allclose(float(told.group(1)), latitude, atol=2e-7)
 
 
+def test_a_survey_gives_its_own_axes() -> None:
+    """Easting and northing of a national grid have seven digits; z points up."""
+    rng = np.random.default_rng(9)
+    true = street(rng, 6)
+    surveyed = {
+        name: (2_600_000.0 + east, 1_200_000.0 + north, 400.0 - down)
+        for name, (east, down, north) in zip(true.names, true.centers, strict=True)
+    }
+    turn = random_rotation(rng)
+    solved = moved_poses(true, Similarity3(5.0, turn, np.ones(3)))
+    fit = fit_survey(solved, surveyed, turn @ UP, noise_m=0.02, rng=rng, survey="points.csv")
+    world = georeferenced_poses(solved, fit)
+    np.testing.assert_allclose(world.centers, true.centers - true.centers[0], atol=2e-3)
+    np.testing.assert_allclose(world.rotations, true.rotations, atol=1e-5)
+    assert (world.axes, world.origin_lla, world.metric) == (WorldAxes.LEVEL, None, True)
+    assert world.frame.startswith("x as x, y down, z as y in points.csv; origin at the first registered camera (26000")
+    assert world.scale.startswith("metres, by the positions in points.csv of 6 of 6 panoramas")
+    few = dict(list(surveyed.items())[:2])
+    reason = fit_survey(solved, few, turn @ UP, noise_m=0.02, rng=rng, survey="points.csv").reason
+    assert reason == "2 of 6 registered panoramas have a position in points.csv; 3 are needed"
+
+
 def test_many_positions_are_fitted_by_a_draw_of_pairs() -> None:
     rng = np.random.default_rng(2)
     true = street(rng, 200, bend_deg=1.0)
@@ -131,7 +155,7 @@ def test_a_room_is_too_small_for_gps() -> None:
     true = street(rng, 6, step_m=0.7)
     fit = fit_gps(true, positions(true, rng, 2.0), UP, gps_noise_m=NOISE_M, rng=rng)
     assert not fit
-    assert "too close for GPS that is good to" in fit.reason
+    assert "too close for positions that are good to" in fit.reason
     assert fit_gps(true, positions(true, rng, 0.01), UP, gps_noise_m=0.01, rng=rng)
 
 
@@ -139,7 +163,7 @@ def test_positions_that_have_nothing_to_do_with_the_poses_are_refused() -> None:
     rng = np.random.default_rng(4)
     true = street(rng, 12)
     shuffled = dict(zip(true.names, rng.permutation(list(positions(true, rng, 0.1).values())), strict=True))
-    assert "GPS positions fit the camera poses" in fit_gps(true, shuffled, UP, gps_noise_m=NOISE_M, rng=rng).reason
+    assert "positions by GPS fit the camera poses" in fit_gps(true, shuffled, UP, gps_noise_m=NOISE_M, rng=rng).reason
 
 
 @pytest.mark.parametrize("same", ["poses", "positions"])
@@ -172,8 +196,5 @@ def test_the_world_tells_where_its_origin_is(home: NDArray[Any]) -> None:
     poses = street(rng, 12)
     lla = {name: tuple(lla_from_local(center, home)) for name, center in zip(poses.names, poses.centers, strict=True)}
     world = georeferenced_poses(poses, fit_gps(poses, lla, UP, gps_noise_m=0.01, rng=rng))
-    origin = origin_of_frame(world.frame)
-    assert origin is not None
-    assert np.abs(local_from_lla(origin, lla[poses.names[0]])).max() < 0.06
-    assert origin_of_frame("the first registered camera") is None
-    assert origin_of_frame("") is None
+    assert world.origin_lla is not None
+    assert np.abs(local_from_lla(world.origin_lla, lla[poses.names[0]])).max() < 0.01

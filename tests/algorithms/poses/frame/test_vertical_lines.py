@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.frame.vertical import find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, Segments, find_segments, up_from_lines
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 
 UP = np.array([0.0, -1.0, 0.0])
 SIZE_HW = (128, 256)
@@ -60,6 +60,45 @@ def test_one_camera_suffices() -> None:
     assert angle_deg(poses.rotations[0] @ UP, UP) > 1  # the camera is tilted
     assert angle_deg(level.rotations[0] @ UP, poses.rotations[0] @ UP) < 0.15
     assert "uncertain by 0.1°" in level.frame
+
+
+def stated(poses: Poses, up_in_cam: NDArray[np.float64]) -> dict[str, tuple[float, float, float]]:
+    """The same pitch and roll in the metadata of all panoramas."""
+    up = up_in_cam / np.linalg.norm(up_in_cam)
+    return dict.fromkeys(poses.names, (float(up[0]), float(up[1]), float(up[2])))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_pitch_and_roll_that_levelled_pictures_still_state_are_not_used(count: int) -> None:
+    """A program had levelled the pictures and left the camera's pitch and roll in the metadata: the world was tilted.
+
+    74 vertical lines were dropped without a word.
+    """
+    cameras = {f"{idx}": Rigid3(np.eye(3), np.array([idx, 0.0, 0.0])) for idx in range(count)}
+    poses = Poses.without_points(cameras, frame="", scale="", metric=False)
+    pictures: dict[str, Picture] = {name: partial(stripes, np.eye(3), phase=0.3) for name in cameras}
+    sensors = stated(poses, np.array([0.2, -0.9, 0.28]))
+    vertical = find_vertical(poses, sensors, pictures)
+    assert angle_deg(vertical.up_in_world, UP) < 0.15
+    assert vertical.source == "lines"
+    assert "sensors" not in vertical.weights
+    assert "are 20.9° off" in vertical.unused
+    assert "vertical lines in the pictures" in vertical.unused
+    assert angle_deg(find_vertical(poses, sensors, pictures, evidence="sensors").up_in_world, UP) > 20
+
+
+def test_cameras_that_are_held_askew_believe_their_sensors() -> None:
+    poses, pictures = capture(3, tilt_deg=0.0)
+    askew = rotation_from_rotvec([0.3, 0.0, 0.2])
+    turned = replace(poses, rotations=askew @ poses.rotations)
+    pictures = {
+        name: partial(stripes, rotation, phase=0.3)
+        for name, rotation in zip(poses.names, turned.rotations, strict=True)
+    }
+    vertical = find_vertical(turned, stated(poses, askew @ UP), pictures)
+    assert angle_deg(vertical.up_in_world, UP) < 0.15
+    assert vertical.weights.keys() == {"lines", "sensors"}
+    assert not vertical.unused
 
 
 def test_masked_lines_do_not_count() -> None:
@@ -131,8 +170,7 @@ def test_an_uncertain_vertical_leaves_the_poses_as_they_are() -> None:
 
 def test_a_world_that_gps_has_turned_stays() -> None:
     poses, pictures = capture()
-    there = "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
-    placed = replace(poses, frame=there)
+    placed = replace(poses, axes=WorldAxes.NORTH, origin_lla=(47.5, 8.25, 410.0))
     same, vertical = level_poses(placed, pictures=pictures)
     assert same is placed
     assert "GPS has already turned it" in vertical.reason
