@@ -85,7 +85,8 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
         warnings=tuple(result.warnings),
-        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(poses)),
+        # Two stages that did the same, such as solvers before and after learned matches, note the same.
+        notes=(*dict.fromkeys(note for summary in result.stages for note in summary.notes), *_scale_notes(poses)),
         results=results,
         poses=poses,
         scores=next(iter(scores.values()), ScoresSummary()),
