@@ -1,55 +1,54 @@
-"""Which images SIFT leaves without enough matches, and which pairs of images learned matches may connect."""
+"""Which images SIFT does not place firmly, and which pairs of images learned matches may connect."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import maximum_flow
 
 from pano_mvs.algorithms.matching.pair_selection import retrieval_pairs, similarities
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs as PlacedPairs
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.scene import Features, Pairs, TwoView, WeakImages
+from pano_mvs.scene import Features, Pairs, Poses, TwoView, WeakImages
+from pano_mvs.scene.pose_groups import split_groups
+
+_DETERMINED_BY = 2  # pairs: one leaves the distance open, two give ten equations for six unknowns
 
 
 @checks_settings
 def weak_images(
     features: Mapping[str, Features],
     matches: Mapping[tuple[str, str], TwoView],
+    poses: Poses,
     *,
     learned: Annotated[
         Literal["auto", "always", "never"],
-        Setting("which images get learned key points: the weakly matched ones, all or none"),
+        Setting("which images get learned key points: those that are not placed firmly without them, all or none"),
     ] = "auto",
-    min_share: Annotated[
-        float, Setting("a pair with fewer verified matches, as a share of its key points, connects weakly", ge=0, le=1)
-    ] = 0.015,
     partners: Annotated[int, Setting("number of similar images that a weak one may match", ge=1)] = 10,
 ) -> WeakImages:
-    """Find the images that pairs with many verified matches do not connect with most of the capture.
+    """Find the images that are not placed firmly by matches without a network.
+
+    An image is placed firmly if it is in the group of poses that has most images of the capture, if two or more pairs
+    that agree with the poses connect it with most others across every cut between them, and if nothing makes its pose
+    doubtful.
 
     Args:
         features: key points of all images, in the capture's order.
         matches: the verified pairs.
-        min_share: number of matches by which a pair connects its images well, as a share of the key points of the image
-            that has fewer. In dense captures, the least share that connects all images is .02 to .15, in tours .005 to
-            .012.
+        poses: what a solver made of these pairs.
     """
     names = list(features)
     if learned != "auto":
         return WeakImages(weak=tuple(names)) if learned == "always" else WeakImages(others=tuple(names))
-    number = {name: idx for idx, name in enumerate(names)}
-    counts = np.array([len(one) for one in features.values()])
-    strong = np.zeros((len(names), len(names)), np.int8)
-    for (first, second), view in matches.items():
-        pair = number[first], number[second]
-        strong[pair] = int(bool(view) and len(view) >= min_share * counts[list(pair)].min())
-    group_of = connected_components(csr_array(strong), directed=False)[1]
-    sizes = np.bincount(group_of)
-    weak = np.flatnonzero((group_of != np.argmax(sizes)) | (sizes[group_of] == 1)).tolist()
+    firm = firmly_placed(poses, matches, count=len(names))
+    weak = [idx for idx, name in enumerate(names) if name not in firm]
     if not weak:
         return WeakImages(others=tuple(names))
     alike = similarities(features.values())
@@ -58,6 +57,46 @@ def weak_images(
     rest = set(range(len(names))) - {*weak} - similar
     groups = (sorted(group) for group in (weak, similar, rest))
     return WeakImages(*(tuple(names[idx] for idx in group) for group in groups))
+
+
+def firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, count: int) -> set[str]:
+    """Return the images that are placed firmly among most of a capture (see `weak_images`).
+
+    Args:
+        poses: of the images that a solver has placed.
+        matches: the pairs from which it has.
+        count: number of images of the capture.
+    """
+    group = split_groups(poses)[0]
+    names = group.names
+    place = {name: idx for idx, name in enumerate(names)}
+    model = PlacedModel(PlacedPairs.without(names), {idx: group.cam_from_world(idx) for idx in place.values()})
+    edges = [
+        (place[first], place[second])
+        for (first, second), view in matches.items()
+        if view and place.keys() >= {first, second} and agrees_with(model, (place[first], place[second]), view)
+    ]
+    firm = _firmly_connected(edges, len(names), at_least=min(_DETERMINED_BY, count - 1))
+    return {names[idx] for idx in firm if names[idx] not in group.doubts} if 2 * len(firm) > count else set()
+
+
+def _firmly_connected(edges: Collection[tuple[int, int]], count: int, *, at_least: int) -> set[int]:
+    """Return the largest set of nodes any two of which at least a number of paths without a common edge connect.
+
+    By Menger's theorem, that is the weakest cut between the two, and so many of their edges hold them together.
+    """
+    ends = np.array(edges, np.intp).reshape(-1, 2)
+    both = np.concatenate([ends, ends[:, ::-1]]).T
+    graph = csr_array(coo_array((np.ones(both.shape[1], np.int32), both), (count, count)))
+    degree = graph.sum(axis=0)
+    left, largest = set(range(count)), set[int]()
+    while len(left) > len(largest):
+        root = max(left, key=lambda node: (degree[node], -node))
+        others = (node for node in sorted(left - {root}) if degree[node] >= at_least)
+        found = {root, *(node for node in others if maximum_flow(graph, root, node).flow_value >= at_least)}
+        largest = max(largest, found, key=len)
+        left -= found
+    return largest
 
 
 @checks_settings

@@ -134,7 +134,10 @@ def matched(capture: Capture, *, learned: bool) -> tuple[dict[str, Features], Vi
     views = {pair: verified(pair) for pair in combinations(features, 2)}
     if not learned:
         return features, views
-    weak = weak_images(features, views)
+    poses = solve_scaled_translation(
+        features, views, load=lambda name: (capture.pictures[name], whole[name]), rng=np.random.default_rng(1)
+    )
+    weak = weak_images(features, views, poses)
     for name in (*weak.weak, *weak.similar):
         points = extract_aliked(
             capture.pictures[name], whole[name], ups=[np.array([0.0, -1.0, 0.0])], max_keypoints=_LEARNED_KEYPOINTS
