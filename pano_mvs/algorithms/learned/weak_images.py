@@ -81,9 +81,9 @@ def firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, c
 
 
 def _firmly_connected(edges: Collection[tuple[int, int]], count: int, *, at_least: int) -> set[int]:
-    """Return the largest set of nodes any two of which at least a number of paths without a common edge connect.
+    """Return the largest set of nodes, any two of which are connected by `at_least` paths without a common edge.
 
-    By Menger's theorem, that is the weakest cut between the two, and so many of their edges hold them together.
+    By Menger's theorem, every cut between two of them then has at least this number of edges.
     """
     ends = np.array(edges, np.intp).reshape(-1, 2)
     both = np.concatenate([ends, ends[:, ::-1]]).T
