@@ -67,8 +67,8 @@ def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -
 def weak(features: All[Features], matches: All[TwoView], poses: One[Poses], params: Params, ctx: Context) -> WeakImages:
     """Find the images that need learned matches, by poses that were solved without them.
 
-    These are images that are not in the group of poses with most images, that a single pair holds there, or whose pose
-    is doubtful. The images most similar to them get learned key points, too.
+    These are images that are not in the group of poses with most images, or that a single pair holds there. The images
+    most similar to them get learned key points, too.
     """
     settings = arguments_from(weak_images, params)
     found = weak_images(features, matches, poses, **settings)
@@ -77,8 +77,8 @@ def weak(features: All[Features], matches: All[TwoView], poses: One[Poses], para
         count, total = len(found.weak), len(features)
         ctx.note(
             f"{count} of {total} {plural(total, 'image')} {plural(count, 'is', 'are')} not placed among most others by "
-            "two or more pairs each way and without doubt, so neural networks match "
-            f"{plural(count, 'it', 'them')}, too (learned: never in this stage forbids it)"
+            f"two or more pairs, so neural networks match {plural(count, 'it', 'them')}, too (learned: never in this "
+            "stage forbids it)"
         )
     return found
 

@@ -231,8 +231,8 @@ def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command,
 
 STOPPED = RunStoppedError("the disk is full")
 REASON = (
-    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage sift_poses would take about 8 B of 5 B of "
-    "memory; --block-size 0 forbids it"
+    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage sift_poses would take about 8 B of 5 B "
+    "of memory; --block-size 0 forbids it"
 )
 
 

@@ -35,9 +35,9 @@ def weak_images(
 ) -> WeakImages:
     """Find the images that are not placed firmly by matches without a network.
 
-    An image is placed firmly if it is in the group of poses that has most images of the capture, if two or more pairs
-    that agree with the poses connect it with most others across every cut between them, and if nothing makes its pose
-    doubtful.
+    An image is placed firmly if it is in the group of poses that has most images of the capture, and if two or more
+    pairs that agree with the poses connect it with most others across every cut between them. Doubts do not count: they
+    mostly come from structure that repeats, which deceives networks as well.
 
     Args:
         features: key points of all images, in the capture's order.
@@ -77,7 +77,7 @@ def firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, c
         if view and place.keys() >= {first, second} and agrees_with(model, (place[first], place[second]), view)
     ]
     firm = _firmly_connected(edges, len(names), at_least=min(_DETERMINED_BY, count - 1))
-    return {names[idx] for idx in firm if names[idx] not in group.doubts} if 2 * len(firm) > count else set()
+    return {names[idx] for idx in firm} if 2 * len(firm) > count else set()
 
 
 def _firmly_connected(edges: Collection[tuple[int, int]], count: int, *, at_least: int) -> set[int]:

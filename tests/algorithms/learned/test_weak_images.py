@@ -110,8 +110,9 @@ def test_pairs_that_contradict_the_poses_hold_nothing() -> None:
     assert weak(RING | pairs("bf") | turned) == "a"
 
 
-def test_a_doubtful_pose_is_weak() -> None:
-    assert weak(RING, replace(placed(), doubts={"c": "pairs contradict it"})) == "c"
+def test_a_doubt_is_no_reason() -> None:
+    """Where structure repeats, networks are deceived, too: of nine right cameras of a hall, two became wrong."""
+    assert weak(RING, replace(placed(), doubts={"c": "the place repeats"})) == ""
 
 
 def test_without_any_pose_all_are_weak() -> None:
