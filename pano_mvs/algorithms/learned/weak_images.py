@@ -1,4 +1,4 @@
-"""Which images SIFT does not place firmly, and which pairs of images learned matches may connect."""
+"""Which images SIFT does not place firmly."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import maximum_flow
 
-from pano_mvs.algorithms.matching.pair_selection import retrieval_pairs, similarities
-from pano_mvs.algorithms.matching.vlad import vlad_descriptor
-from pano_mvs.algorithms.poses.placement.placed_model import Pairs as PlacedPairs
-from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.matching.pair_selection import similarities
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.scene import Features, Pairs, Poses, TwoView, WeakImages
+from pano_mvs.scene import Features, Poses, TwoView, WeakImages
 from pano_mvs.scene.pose_groups import split_groups
 
 _DETERMINED_BY = 2  # pairs: one leaves the distance open, two give ten equations for six unknowns
@@ -47,7 +45,7 @@ def weak_images(
     names = list(features)
     if learned != "auto":
         return WeakImages(weak=tuple(names)) if learned == "always" else WeakImages(others=tuple(names))
-    firm = firmly_placed(poses, matches, count=len(names))
+    firm = _firmly_placed(poses, matches, count=len(names))
     weak = [idx for idx, name in enumerate(names) if name not in firm]
     if not weak:
         return WeakImages(others=tuple(names))
@@ -59,7 +57,7 @@ def weak_images(
     return WeakImages(*(tuple(names[idx] for idx in group) for group in groups))
 
 
-def firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, count: int) -> set[str]:
+def _firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, count: int) -> set[str]:
     """Return the images that are placed firmly among most of a capture (see `weak_images`).
 
     Args:
@@ -70,7 +68,7 @@ def firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, c
     group = split_groups(poses)[0]
     names = group.names
     place = {name: idx for idx, name in enumerate(names)}
-    model = PlacedModel(PlacedPairs.without(names), {idx: group.cam_from_world(idx) for idx in place.values()})
+    model = PlacedModel(Pairs.without(names), {idx: group.cam_from_world(idx) for idx in place.values()})
     edges = [
         (place[first], place[second])
         for (first, second), view in matches.items()
@@ -97,27 +95,3 @@ def _firmly_connected(edges: Collection[tuple[int, int]], count: int, *, at_leas
         largest = max(largest, found, key=len)
         left -= found
     return largest
-
-
-@checks_settings
-def learned_pairs(
-    features: Mapping[str, Features],
-    matches: Mapping[tuple[str, str], TwoView] | None = None,
-    *,
-    neighbours: Annotated[int, Setting("number of most similar images to match each one with", ge=1)] = 8,
-) -> Pairs:
-    """Pair each image that has learned key points with those whose learned descriptors are most similar.
-
-    Verified pairs of such images are among them, so that a network looks at every pair that the poses rely on.
-
-    Args:
-        features: key points of all images, in the capture's order.
-        matches: pairs that were compared without a network.
-    """
-    descriptors = {
-        name: vlad_descriptor(one.only_learned(), sample=1000) for name, one in features.items() if one.learned
-    }
-    found = retrieval_pairs(list(descriptors), descriptors, neighbours=neighbours)
-    verified = {pair for pair, view in (matches or {}).items() if descriptors.keys() >= {*pair} and view}
-    place = {name: idx for idx, name in enumerate(features)}
-    return Pairs(tuple(sorted({*found.pairs, *verified}, key=lambda pair: (place[pair[0]], place[pair[1]]))))

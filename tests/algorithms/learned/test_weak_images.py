@@ -11,7 +11,8 @@ import pytest
 
 from pano_mvs.algorithms.learned.aliked import joined
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM
-from pano_mvs.algorithms.learned.weak_images import learned_pairs, weak_images
+from pano_mvs.algorithms.learned.similar_pairs import learned_pairs
+from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.poses.frame.gauge import no_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.lightglue import match_learned
-from pano_mvs.algorithms.learned.weak_images import learned_pairs, weak_images
+from pano_mvs.algorithms.learned.similar_pairs import learned_pairs
+from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
