@@ -9,10 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import RunStoppedError, UsageError
 from pano_mvs.scene.poses import PER_CAMERA, Pose, Poses
 
 ALONE = "no other image shares its frame, so its position is meaningless"
+CLOSER = "Take panoramas closer together (0.5–1 m indoors) with more overlap"
+
+
+def require_two_cameras(poses: Poses, *, remedy: str = CLOSER) -> None:
+    """Check that poses have two cameras or more, without which there is nothing to sweep.
+
+    Args:
+        remedy: what the user can do about it.
+
+    Raises:
+        RunStoppedError: if they have fewer.
+    """
+    if len(poses.names) < 2:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
+        raise RunStoppedError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
 
 
 def split_groups(poses: Poses) -> list[Poses]:

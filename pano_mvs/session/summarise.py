@@ -86,7 +86,8 @@ def summarise(run: Run, poses: Poses | None, *, started: datetime, seconds: floa
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
         warnings=tuple(result.warnings),
-        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(posed)),
+        # Two stages that did the same, such as solvers before and after learned matches, note the same.
+        notes=(*dict.fromkeys(note for summary in result.stages for note in summary.notes), *_scale_notes(posed)),
         results=results,
         poses=posed,
         scores=next(iter(scores.values()), ScoresSummary()),

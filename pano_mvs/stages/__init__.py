@@ -34,7 +34,7 @@ from pano_mvs.stages.filters import (
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
-from pano_mvs.stages.matches import brute_force, lightglue, merge, weak
+from pano_mvs.stages.matches import brute_force, lightglue, merge
 from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
@@ -42,3 +42,4 @@ from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.rigs import colmap_lenses, dual_fisheye
 from pano_mvs.stages.source import folder, tour
 from pano_mvs.stages.source_video import video
+from pano_mvs.stages.weak_images import weak

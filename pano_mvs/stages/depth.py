@@ -49,7 +49,7 @@ from pano_mvs.api import (
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.io.growing_arrays import GrowingArrays
-from pano_mvs.scene.pose_groups import require_one_group
+from pano_mvs.scene.pose_groups import require_one_group, require_two_cameras
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.filters import bytes_per_pixel
 
@@ -168,6 +168,7 @@ def known_floors(poses: One[Poses], images: All[Panorama], ctx: Context) -> Stru
 @stage("views.nearest", settings=select_views)
 def nearest(poses: One[Poses], params: Params, ctx: Context) -> Views:
     """Choose images that see the same points from sufficiently different positions, best first."""
+    require_two_cameras(poses)
     views = select_views(poses, **arguments_from(select_views, params))
     for name in poses.names:
         if name not in views.neighbours:

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.algorithms.learned.lightglue import match_learned
-from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.api import All, Context, Features, Near, Params, TwoView, TwoViews, arguments_from, params_from, stage
-from pano_mvs.core.text import plural
-from pano_mvs.scene import WeakImages
 from pano_mvs.stages.features import NetworkParams
 
 
@@ -48,26 +45,6 @@ def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -
     two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
     _report_pair(two_view, len(candidates), ctx)
     return two_view
-
-
-@stage("matches.weak", settings=weak_images, memory="600MB")
-def weak(features: All[Features], matches: All[TwoView], params: Params, ctx: Context) -> WeakImages:
-    """Find the images that their matches hardly connect with the rest, for which learned matches are worth their time.
-
-    A pair in which a large share of the key points match connects its images well. The images outside of the largest
-    group that such pairs connect get learned key points, and so do the images most similar to them.
-    """
-    settings = arguments_from(weak_images, params)
-    found = weak_images(features, matches, **settings)
-    ctx.metric("weak", len(found.weak) / max(1, len(features)))
-    if found.weak and settings["learned"] == "auto":
-        count, total = len(found.weak), len(features)
-        ctx.note(
-            f"{count} of {total} {plural(total, 'image')} {plural(count, 'has', 'have')} no pair that leads to most "
-            f"others and in which {100 * settings['min_share']:g} % of the key points match, so neural networks match "
-            f"{plural(count, 'it', 'them')}, too (learned: never in this stage forbids it)"
-        )
-    return found
 
 
 @stage("matches.merge")

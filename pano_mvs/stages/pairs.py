@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pano_mvs.algorithms.learned.weak_images import learned_pairs
+from pano_mvs.algorithms.learned.similar_pairs import learned_pairs
 from pano_mvs.algorithms.matching.pair_selection import (
     automatic_pairs,
     east_north_m,

@@ -27,7 +27,6 @@ from pano_mvs.api import (
     Panorama,
     Params,
     Poses,
-    RunStoppedError,
     TwoView,
     arguments_from,
     params_from,
@@ -36,7 +35,7 @@ from pano_mvs.api import (
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import match_images, read_groups, recorded_pictures
-from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.scene.pose_groups import CLOSER, join_groups, require_two_cameras, split_groups
 
 
 @params_from(solve_scaled_translation, own_last=True)
@@ -75,7 +74,7 @@ def scaled_translation(
         load=panorama_loader(images) if params.ask_images else None,
         rng=ctx.rng,
     )
-    return checked_poses(poses, ctx)
+    return reported_poses(poses, ctx)
 
 
 def _without_false_closures(
@@ -240,14 +239,21 @@ def triangulate(
     return checked_poses(points, ctx)
 
 
-_CLOSER = "Take panoramas closer together (0.5–1 m indoors) with more overlap"
-
-
-def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses:
+def checked_poses(poses: Poses, ctx: Context, *, remedy: str = CLOSER) -> Poses:
     """Report images that were left out; stop the run if fewer than two are registered.
 
     Raises:
-        RunStoppedError: if fewer than two images are registered, because then there is nothing to sweep.
+        RunStoppedError: if fewer than two images are registered.
+    """
+    reported_poses(poses, ctx)
+    require_two_cameras(poses, remedy=remedy)
+    return poses
+
+
+def reported_poses(poses: Poses, ctx: Context) -> Poses:
+    """Report images that were left out.
+
+    For solvers, which may place none: learned matches, or photographs, may still place more.
     """
     for name, reason in poses.rejected.items():
         ctx.reject(name, reason)
@@ -261,9 +267,6 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
         rightly = float(np.nansum(poses.right_probabilities))
         ctx.metric("registered_rightly", rightly / max(1, registered + len(poses.rejected)))
     ctx.metric("groups", len(poses.worlds))
-    if registered < 2:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
-        raise RunStoppedError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
     return poses
 
 

@@ -22,7 +22,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
-from pano_mvs.stages.poses import checked_poses, known_poses
+from pano_mvs.stages.poses import checked_poses, known_poses, reported_poses
 
 
 @params_from(solve_colmap, own_last=True)
@@ -43,7 +43,7 @@ class ColmapParams(Params):
 @stage("poses.colmap")
 def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapParams, ctx: Context) -> Poses:
     """Solve poses by COLMAP's incremental or global mapper, from our key points and verified matches."""
-    return checked_poses(_mapped(features, matches, params, ctx=ctx), ctx)
+    return reported_poses(_mapped(features, matches, params, ctx=ctx), ctx)
 
 
 @params_from(colmap_sift)

@@ -231,8 +231,8 @@ def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command,
 
 STOPPED = RunStoppedError("the disk is full")
 REASON = (
-    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage poses would take about 8 B of 5 B of "
-    "memory; --block-size 0 forbids it"
+    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage sift_poses would take about 8 B of 5 B "
+    "of memory; --block-size 0 forbids it"
 )
 
 
@@ -245,7 +245,7 @@ def test_a_capture_that_memory_does_not_hold_is_divided(pano_mvs: Command, runs:
     assert len(load(Path("out")).summary.poses.registered) == 26
     first = EventReader(Path("out/blocks")).read()[1][0][1]
     assert first == Divided(REASON)
-    assert runs.rough == dict.fromkeys(runs.seen, ("poses",))
+    assert runs.rough == dict.fromkeys(runs.seen, ("sift_poses",))
 
 
 @pytest.mark.usefixtures("small_memory")
@@ -299,7 +299,7 @@ def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
     Path("mine/notes.txt").touch()
     runs.ends = {"quickstart": STOPPED, "mine": STOPPED}
     result = pano_mvs("run", "quickstart", "--images", walk, *options)
-    assert result.flat.startswith("warning: all at once, stage poses would take about")
+    assert result.flat.startswith("warning: all at once, stage sift_poses would take about")
     assert reason in result.flat
     assert len(runs.seen) == 1
 

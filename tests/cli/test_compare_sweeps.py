@@ -16,6 +16,7 @@ FIXED = """\
 pano_mvs: 1
 stages:
   pairs: {in: {poses: poses}}
+  sift_poses: null
   weak: null
   learned: null
   likely: null

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.core.errors import ContractError, UsageError
+from pano_mvs.core.errors import ContractError, RunStoppedError, UsageError
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
-from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups, with_cameras
+from pano_mvs.scene.pose_groups import join_groups, per_group, require_two_cameras, split_groups, with_cameras
 from tests.scene.pose_groups import drawn_group
 from tests.scene.test_kinds import assert_same
 
@@ -145,3 +145,10 @@ def test_points_that_a_single_camera_is_left_of_go_with_the_others() -> None:
     np.testing.assert_array_equal(kept.points_in_world, _LARGE.points_in_world[10:])
     assert len(kept.track_point_idx) == 2 * 20
     assert with_cameras(large, np.ones(3, np.bool_)) is large
+
+
+def test_one_camera_is_no_model() -> None:
+    require_two_cameras(_SMALL)
+    alone = with_cameras(replace(_SMALL, rejected={"c.jpg": "blurred"}), np.array([True, False]))
+    with pytest.raises(RunStoppedError, match=r"no two panoramas .* no model\. Walk\. c\.jpg: blurred$"):
+        require_two_cameras(alone, remedy="Walk")

@@ -13,10 +13,12 @@ from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.stages.depth import nearest
 from pano_mvs.stages.poses import ScaledTranslationParams, scaled_translation, verify
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 VerifyParams = Registry.installed().stages["poses.verify"].params_type
+NearestParams = Registry.installed().stages["views.nearest"].params_type
 
 WRONG = "002.png"
 
@@ -99,6 +101,21 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
     with pytest.raises(RunStoppedError, match=r"001\.png: no pair"):
         verify(poses=alone, images=tiny.each(Panorama), features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
+
+
+def test_a_solver_that_places_nothing_leaves_it_to_the_next_stages_to_stop(tiny: TinyCapture, ctx: Context) -> None:
+    """The run ended although learned matches, which come after the poses of SIFT, may place all images."""
+    poses = scaled_translation(
+        features=tiny.each(Features),
+        matches={},
+        images=tiny.each(Panorama),
+        params=ScaledTranslationParams(),
+        ctx=ctx,
+    )
+    assert poses.names == ()
+    assert set(ctx.rejected) == set(poses.rejected) == set(tiny.names)
+    with pytest.raises(RunStoppedError, match="no two panoramas could be registered"):
+        nearest(poses=poses, params=NearestParams(), ctx=ctx)
 
 
 @pytest.mark.parametrize("ask_images", [False, True])

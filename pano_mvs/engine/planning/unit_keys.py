@@ -142,7 +142,7 @@ def _path_digest(path: Path) -> str:
         ) from error
 
 
-KEY_SCHEMA = 3
+KEY_SCHEMA = 4
 """Raise this if the engine passes other inputs, seeds or settings for the same key, or makes keys differently."""
 
 
@@ -378,8 +378,7 @@ class Resolver:
             return [ref.digest for ref in value.values()]
         if self.edges[port].port.cardinality is Cardinality.NAMES:
             return list(value)
-        state = self.states[self.edges[port].producer]
-        return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
+        return [[name, ref.digest] for name, ref in value.items()]
 
 
 def single_unit(entry: StageEntry, inputs: Mapping[str, ItemRef | None], store: Store) -> Unit:

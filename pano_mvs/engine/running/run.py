@@ -91,7 +91,7 @@ class Run:
         self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
         self.keys: dict[str, dict[str, str]] = {}  # stage to unit to cache key, of all units that were looked up
-        self.computed: set[str] = set()
+        self.computed: dict[str, str] = {}  # key of each unit that this run computed to its stage
         self.refreshed: set[str] = set()  # labels of the units that `--refresh` named and that were reached
         self._planned: dict[str, UnitRecord] = {}
         self._has_passed = False  # whether the last pass ended without an error
@@ -280,7 +280,9 @@ class RunPass:
         except RunStoppedError as error:
             stop = error
         finally:
-            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced())
+            self._statistics.put_in_order(
+                self.queue.position_of, replaced=self._replaced(), superseded=self._superseded()
+            )
         if stop is not None:
             self.result.stopped, self.result.exit_code = str(stop), stop.exit_code
         else:
@@ -290,7 +292,7 @@ class RunPass:
         """Wait until the running units have ended; their results are in the cache."""
         while (finished := self._run.dispatcher.next_finished()) is not None:
             if finished.outcome.record is not None:
-                self._run.computed.add(finished.unit.key)
+                self._run.computed[finished.unit.key] = finished.unit.entry.name
 
     def _settle_all(self) -> None:
         """Take ready units and finished jobs in turn, until every unit has a result or cannot have one."""
@@ -326,7 +328,7 @@ class RunPass:
         for path in self._store.damaged[known:]:
             self._run.warn(f"{path} is damaged; computing it again")
         if record is not None:
-            self._record(unit, record, was_computed=unit.key in self._run.computed)
+            self._record(unit, record, was_computed=self._run.computed.get(unit.key) == unit.entry.name)
         return record is not None
 
     def _dispatch(self, unit: Unit) -> bool:
@@ -368,7 +370,7 @@ class RunPass:
         if outcome.status == "stopped":
             raise _STOPPING_ERRORS.get(outcome.error, PanoMvsError)(outcome.cause)
         if outcome.record is not None:
-            self._run.computed.add(unit.key)
+            self._run.computed[unit.key] = unit.entry.name
             self._record(unit, outcome.record, was_computed=True)
         else:
             self._fail(finished)
@@ -427,3 +429,24 @@ class RunPass:
             for edge in self._run.graph.edges[name].values()
             if issubclass(stages[name].spec.output, stages[edge.producer].spec.output)
         }
+
+    def _superseded(self) -> set[str]:
+        """Return the stages whose value of the whole capture only led to that of a finished later stage of its kind.
+
+        The later stage depends on the value, but is not made from it, so it does not pass on what is wrong with it.
+        """
+        stages, states, edges = self._run.workflow.stages, self.queue.states, self._run.graph.edges
+        above: dict[str, set[str]] = {}  # the stages on which one depends
+        made_from: dict[str, set[str]] = {}  # those from whose values of its kind its own is made
+        found: set[str] = set()
+        for name in self._run.graph.order:
+            output = stages[name].spec.output
+            feeding = {edge.producer for edge in edges[name].values()}
+            alike = {producer for producer in feeding if issubclass(output, stages[producer].spec.output)}
+            above[name] = feeding.union(*(above[producer] for producer in feeding))
+            made_from[name] = alike.union(*(made_from[producer] for producer in alike))
+            if output.axis is Axis.ONE and states[name].items:
+                found |= {
+                    other for other in above[name] - made_from[name] if issubclass(output, stages[other].spec.output)
+                }
+        return found

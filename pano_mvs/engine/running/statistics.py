@@ -176,12 +176,14 @@ class RunStatistics:
         position_of: Callable[[str, str], tuple[int, int]],
         *,
         replaced: Collection[str] = frozenset(),
+        superseded: Collection[str] = frozenset(),
     ) -> None:
         """Sort the result by workflow and capture, so that it does not depend on which unit ended first.
 
         Args:
             position_of: returns the position of a unit in the workflow and in the capture.
             replaced: stages whose results later stages replaced: their doubts do not count any more.
+            superseded: stages whose results only led to those that count: neither do the images that they left out.
         """
         result = self._result
         result.stages.sort(key=lambda summary: position_of(summary.stage, ""))
@@ -194,6 +196,8 @@ class RunStatistics:
                     reasons.setdefault(image, (stage, reason))
 
         for summary in result.stages:
+            if summary.stage in superseded:
+                continue
             enter(summary.stage, summary.rejected, result.rejected)
             enter(summary.stage, {} if summary.stage in replaced else summary.doubts, result.doubts)
 

@@ -72,6 +72,12 @@ def test_quickstart_recovers_poses_and_ranges(quickstart: tuple[Path, str]) -> N
         assert view["completeness"] > 0.95
 
 
+def test_poses_are_solved_once_where_sift_suffices(quickstart: tuple[Path, str]) -> None:
+    """The pairs that matches.merge returned had other keys than those of SIFT, of which they are made."""
+    stages = {stage["name"]: (stage["run"], stage["cached"]) for stage in run_json(quickstart[0])["stages"]}
+    assert (stages["sift_poses"], stages["rematched"], stages["poses"]) == ((1, 0), (0, 0), (0, 1))
+
+
 def test_ranges_and_confidences_fit_together(quickstart: tuple[Path, str]) -> None:
     out, _ = quickstart
     for name in NAMES:

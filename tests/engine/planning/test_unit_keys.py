@@ -112,7 +112,7 @@ def test_names_of_what_will_come_count_and_of_what_failed_do_not(resolved: Resol
 def test_a_gather_waits_for_all_and_does_without_what_failed(resolved: Resolved) -> None:
     units, _ = resolved("shifted", scaled=images("a", "b", "c", failed="b"))
     assert units[WHOLE].inputs == {"xs": {"a": ref("a"), "c": ref("c")}}
-    assert units[WHOLE].identity["inputs"] == {"xs": [[["a"], DIGEST["a"]], [["c"], DIGEST["c"]]]}
+    assert units[WHOLE].identity["inputs"] == {"xs": [["a", DIGEST["a"]], ["c", DIGEST["c"]]]}
     assert resolved("shifted", scaled=images("a", "b", pending="b"))[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=OPEN)[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
@@ -227,7 +227,7 @@ def test_a_stage_reads_several_producers(resolved: Resolved) -> None:
     pairs = StageState(Axis.PAIR, {"a | b": ref("ab")}, {}, {"a | b": ("a", "b")})
     units, _ = resolved("all", difference=pairs, shifted=whole(ref("s")))
     assert units[WHOLE].identity["inputs"] == {
-        "differences": [[["a", "b"], DIGEST["ab"]]],
+        "differences": [["a | b", DIGEST["ab"]]],
         "shifted": DIGEST["s"],
     }
     for state, blocked, waiting in (

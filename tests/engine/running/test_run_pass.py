@@ -311,13 +311,13 @@ def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
 ) -> None:
     session = toy.session()
     run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
-    run.computed.add("z")
+    run.computed["z"] = "scaled"
     record, entry = UnitRecord("a", {}, ItemRef("K", "d" * 32, {})), session.workflow.stages["scaled"]
     outcomes = {"a": JobOutcome("done", record), "b": JobOutcome("failed"), "c": JobOutcome("done", record)}
     ended = [FinishedJob(Unit(entry, key, (), {}, key, {}), outcome) for key, outcome in outcomes.items()]
     monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
     RunPass(run, []).drain()
-    assert run.computed == {"a", "c", "z"}
+    assert run.computed == dict.fromkeys("zac", "scaled")
 
 
 GUESSES = '''
@@ -345,6 +345,24 @@ def guess(xs: All[Number], params: GuessParams) -> Guess:
 def guess_again(guess: One[Guess], params: GuessParams) -> Guess:
     """Doubt what the settings say."""
     return Guess(params.doubts)
+
+
+class GuessAllParams(GuessParams):
+    left_out: dict[str, str] = {}
+
+
+@stage("toy.guess_all")
+def guess_all(xs: All[Number], params: GuessAllParams, ctx: Context) -> Guess:
+    """Doubt and leave out what the settings say."""
+    for name, why in params.left_out.items():
+        ctx.reject(name, why)
+    return Guess(params.doubts)
+
+
+@stage("toy.by_guess")
+def by_guess(x: Each[Number], guess: One[Guess]) -> Number:
+    """Return the number."""
+    return x
 
 
 @stage("toy.count_doubts")
@@ -396,6 +414,31 @@ def test_a_doubt_of_a_value_that_nothing_replaces_counts_whatever_else_reads_it(
     (guesses.folder / "wf.yaml").write_text(WORKFLOW.replace("  second: {use: toy.guess_again}\n", ""))
     result = guesses.run("first.doubts={2.txt: odd}")
     assert (result.exit_code, result.doubts) == (3, {"2.txt": ("first", "odd")})
+
+
+SOLVED_TWICE = """\
+  used:   {use: toy.by_guess}
+  again:  {use: toy.guess_all, in: {xs: used}, left_out: {3.txt: late}}
+"""
+
+
+def test_what_a_value_that_only_led_to_another_says_does_not_count(guesses: Toy) -> None:
+    """Images that SIFT alone does not place were reported, though learned matches placed them."""
+    first = "  first:  {use: toy.guess_all, doubts: {2.txt: odd}, left_out: {1.txt: blurred}}\n"
+    head = WORKFLOW[: WORKFLOW.index("  first:")]
+    (guesses.folder / "wf.yaml").write_text(head + first)
+    alone = guesses.run()
+    assert (alone.doubts, alone.rejected) == ({"2.txt": ("first", "odd")}, {"1.txt": ("first", "blurred")})
+    (guesses.folder / "wf.yaml").write_text(head + first + SOLVED_TWICE)
+    both = guesses.run()
+    assert (both.exit_code, both.doubts, both.rejected) == (3, {}, {"3.txt": ("again", "late")})
+
+
+def test_a_stage_that_does_what_another_did_is_cached(guesses: Toy) -> None:
+    """The poses counted as computed twice where learned matches added nothing."""
+    (guesses.folder / "wf.yaml").write_text(WORKFLOW.partition("  count:")[0].replace("toy.guess_again", "toy.guess"))
+    states = {stage.stage: (stage.run, stage.cached) for stage in guesses.run().stages}
+    assert (states["first"], states["second"]) == ((1, 0), (0, 1))
 
 
 def test_files_of_an_earlier_run_go_though_something_is_doubtful(guesses: Toy) -> None:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.lightglue import match_learned
-from pano_mvs.algorithms.learned.weak_images import learned_pairs, weak_images
+from pano_mvs.algorithms.learned.similar_pairs import learned_pairs
+from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
@@ -134,7 +135,10 @@ def matched(capture: Capture, *, learned: bool) -> tuple[dict[str, Features], Vi
     views = {pair: verified(pair) for pair in combinations(features, 2)}
     if not learned:
         return features, views
-    weak = weak_images(features, views)
+    poses = solve_scaled_translation(
+        features, views, load=lambda name: (capture.pictures[name], whole[name]), rng=np.random.default_rng(1)
+    )
+    weak = weak_images(features, views, poses)
     for name in (*weak.weak, *weak.similar):
         points = extract_aliked(
             capture.pictures[name], whole[name], ups=[np.array([0.0, -1.0, 0.0])], max_keypoints=_LEARNED_KEYPOINTS
