@@ -13,7 +13,7 @@ import pytest
 
 from pano_mvs.algorithms.logistic import steps_behind
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tools.benchmarks.belief import fitting
@@ -141,7 +141,7 @@ def test_every_measurement_of_a_table_is_measured() -> None:
     poses = Poses.without_points(dict(zip(tiny.names, tiny.poses, strict=True)), frame="x", scale="x", metric=True)
     whole = np.ones((128, 256), np.bool_)
     loaded = {name: (image, whole) for name, image in zip(tiny.names, tiny.pictures, strict=True)}
-    group = verified_group(
+    group = verify_poses(
         poses, loaded.__getitem__, features=tiny.each(Features), two_views=tiny.each(TwoView), correct=False
     )
     assert [*group.evidence] == [*tiny.names]
@@ -149,7 +149,7 @@ def test_every_measurement_of_a_table_is_measured() -> None:
         assert row.keys() == SIGNS.keys()
         assert (row["ratio"] or 0) > 0.7
         assert (row["agreeing"] or 0) > 1
-    without = verified_group(poses, loaded.__getitem__, features={}, two_views={}, correct=False)
+    without = verify_poses(poses, loaded.__getitem__, correct=False)
     for row in without.evidence.values():
         assert row["agreeing"] is None
         assert (row["ratio"] or 0) > 0.7

@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import maximum_flow
 
 from pano_mvs.algorithms.matching.pair_selection import similarities
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView, WeakImages
 from pano_mvs.scene.pose_groups import split_groups
@@ -72,7 +71,7 @@ def _firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, 
     edges = [
         (place[first], place[second])
         for (first, second), view in matches.items()
-        if view and place.keys() >= {first, second} and agrees_with(model, (place[first], place[second]), view)
+        if view and place.keys() >= {first, second} and model.agrees_with((place[first], place[second]), view)
     ]
     firm = _firmly_connected(edges, len(names), at_least=min(_DETERMINED_BY, count - 1))
     return {names[idx] for idx in firm} if 2 * len(firm) > count else set()

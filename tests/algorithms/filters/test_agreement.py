@@ -14,8 +14,8 @@ from pano_mvs.algorithms.filters.consistency import (
     _step_around,
     check_consistency,
     checked_with_agreement,
+    evidence_of_views,
     nearest_views,
-    view_doubts,
 )
 from pano_mvs.algorithms.filters.uncertainty import (
     EXPONENTS,
@@ -301,11 +301,11 @@ def test_a_moved_camera_is_doubted_alone(five_maps: list[RangeMap]) -> None:
     for poses, expected in ((FIVE_POSES, set()), (moved, {"1"})):
         agreements = {str(idx): agreement_of(five_maps, poses, idx) for idx in range(len(poses))}
         centers = {str(idx): pose.center for idx, pose in enumerate(poses)}
-        assert set(view_doubts(agreements, centers)) == expected
+        assert set(evidence_of_views(agreements, centers)) == expected
 
 
 def test_the_reason_names_the_figures() -> None:
-    (reason,) = view_doubts(*line([GOOD, GOOD, WRONG, GOOD])).values()
+    ((_, reason),) = evidence_of_views(*line([GOOD, GOOD, WRONG, GOOD])).values()
     assert reason == (
         "other views agree with 20 % of its ranges (usual around it: 50 %) and contradict 60 % in one direction"
     )
@@ -320,22 +320,22 @@ def test_the_reason_names_the_figures() -> None:
     ],
 )
 def test_views_are_not_doubted_for_less(view: Agreement) -> None:
-    assert view_doubts(*line([GOOD, GOOD, view, GOOD])) == {}
+    assert evidence_of_views(*line([GOOD, GOOD, view, GOOD])) == {}
 
 
 def test_nothing_is_said_where_nobody_agrees_or_nobody_is_there_to_compare_with() -> None:
     poor = replace(GOOD, agreed=0.09)
-    assert view_doubts(*line([poor, poor, replace(WRONG, agreed=0.01), poor])) == {}
-    assert view_doubts(*line([GOOD, WRONG])) == {}
+    assert evidence_of_views(*line([poor, poor, replace(WRONG, agreed=0.01), poor])) == {}
+    assert evidence_of_views(*line([GOOD, WRONG])) == {}
     agreements, centers = line([GOOD, GOOD, WRONG, GOOD])
-    assert view_doubts(agreements, {name: place for name, place in centers.items() if name != "2.jpg"}) == {}
+    assert evidence_of_views(agreements, {name: place for name, place in centers.items() if name != "2.jpg"}) == {}
 
 
 def test_only_the_nearest_views_count() -> None:
     """At the far end of a long capture of a plain corridor everybody agrees little."""
     poor = replace(WRONG, agreed=0.22)
-    assert view_doubts(*line([GOOD] * 6 + [poor] * 2 + [WRONG] + [poor] * 2)) == {}
-    assert set(view_doubts(*line([GOOD] * 8 + [WRONG] + [GOOD] * 2))) == {"8.jpg"}
+    assert evidence_of_views(*line([GOOD] * 6 + [poor] * 2 + [WRONG] + [poor] * 2)) == {}
+    assert set(evidence_of_views(*line([GOOD] * 8 + [WRONG] + [GOOD] * 2))) == {"8.jpg"}
 
 
 @pytest.mark.parametrize("case", ["random", "grid", "few", "coincident"])

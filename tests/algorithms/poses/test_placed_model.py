@@ -55,7 +55,9 @@ def test_a_camera_that_stands_elsewhere_agrees_with_less(model: PlacedModel, cap
 def test_a_copy_is_independent(model: PlacedModel, capture: AliasedCapture) -> None:
     chosen, points = dict(model.chosen), model.known_points(5, {0: 0})[0]
     copied = model.copy()
-    copied.remove(0)
+    del copied.cameras[0]
+    copied.choose_again()
+    copied.learn_ranges()
     copied.add(4, shifted_pose(capture.poses["4.jpg"], 3))
     assert model.chosen == chosen
     assert sorted(model.cameras) == list(range(6))
@@ -63,10 +65,22 @@ def test_a_copy_is_independent(model: PlacedModel, capture: AliasedCapture) -> N
 
 
 def test_a_removed_image_leaves_nothing_behind(model: PlacedModel) -> None:
-    model.remove(2)
-    assert 2 not in model.cameras
-    assert not any(2 in edge for edge in model.chosen)
-    assert 2 not in model.evidence(0).partner
+    """Ranges that key points had from the pose of an image stayed when it was moved or removed."""
+    left = model.with_cameras({image: camera for image, camera in model.cameras.items() if image != 2})
+    assert 2 not in left.cameras
+    assert not any(2 in edge for edge in left.chosen)
+    assert 2 not in left.evidence(0).partner
+    assert np.isnan(left.known_ranges(2)).all()
+
+
+def test_ranges_of_all_images_follow_from_the_cameras_alone(model: PlacedModel, capture: AliasedCapture) -> None:
+    """After a detour of one camera, its partners kept ranges from where it had been."""
+    true = dict(model.cameras)
+    away = model.with_cameras({**true, 4: shifted_pose(capture.poses["4.jpg"], 3)})
+    back, fresh = away.with_cameras(true), model.with_cameras(true)
+    assert back.chosen == fresh.chosen
+    for image in true:
+        np.testing.assert_array_equal(back.known_ranges(image), fresh.known_ranges(image))
 
 
 def test_known_points_are_where_their_rays_point(model: PlacedModel, capture: AliasedCapture) -> None:
@@ -86,7 +100,7 @@ def test_points_of_a_false_geometry_are_elsewhere(model: PlacedModel, capture: A
 
 
 def test_an_image_is_placed_and_polished_where_it_stands(model: PlacedModel, capture: AliasedCapture) -> None:
-    model.remove(3)
+    model = model.with_cameras({image: camera for image, camera in model.cameras.items() if image != 3})
     evidence, found = model.place(3)
     pose, support, known = model.polished(3, evidence, found[0])
     assert support >= points_needed(known)

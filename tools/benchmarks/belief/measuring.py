@@ -19,7 +19,7 @@ from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
-from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
@@ -103,9 +103,9 @@ def measure(capture: Capture) -> tuple[list[dict[str, Any]], dict[str, float]]:
             )
         poses = _displaced(solved, rng) if variant == "displaced" else solved
         given = variant == "displaced"
-        for group_number, group in enumerate(split_groups(poses)):
-            if len(group.names) > 1:
-                found = verified_group(group, load, features=features, two_views=views, correct=not given)
+        verified = verify_poses(poses, load, features=features, two_views=views, correct=not given)
+        for group_number, found in enumerate(split_groups(verified)):
+            if len(found.names) > 1:
                 rows = rows_of(capture, variant, found, group=group_number, learned=learned)
                 if not any(_is_same(rows, known) for known in groups):
                     groups.append(rows)

@@ -18,7 +18,7 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
-from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.scene.pose_groups import split_groups
@@ -53,8 +53,7 @@ def measure_tour(
 
     poses = solve_scaled_translation(features, views, load=load, rng=np.random.default_rng(0))
     rows: list[dict[str, Any]] = []
-    for number, group in enumerate(split_groups(poses)):
-        found = verified_group(group, load, features=features, two_views=views, correct=True)
+    for number, found in enumerate(split_groups(verify_poses(poses, load, features=features, two_views=views))):
         rows += rows_of(capture, "asked", found, group=number, learned=True, limits=truth[1])
     return rows
 

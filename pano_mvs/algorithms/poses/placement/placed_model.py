@@ -25,7 +25,7 @@ from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POI
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
 from pano_mvs.algorithms.two_view.verification import verify_pose, weight_of_pair
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
 
@@ -159,6 +159,15 @@ class PlacedModel:
         evidence, pose = self.evidence(image), self.cameras[image]
         agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
         return {_edge(image, partner): rank for partner, rank in explained_partners(evidence, agrees).items()}
+
+    def agrees_with(self, edge: Edge, view: TwoView) -> bool:
+        """Return whether a geometry of a pair of registered images has their rotation and direction."""
+        relative = self.cameras[edge[1]] @ self.cameras[edge[0]].inverse()
+        turned = geodesic_angle(view.rotation, relative.rotation)
+        return bool(
+            turned < float(np.deg2rad(3.0))
+            and angle_between(view.direction, relative.translation) < float(np.deg2rad(10.0))
+        )
 
     def with_cameras(self, cameras: Mapping[int, Rigid3]) -> PlacedModel:
         """Return a model of the same pairs with other cameras, whose geometries and ranges depend on these alone."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import check_cameras, correct_cameras
-from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -48,6 +48,12 @@ def verified(poses: Poses, matches: Matches | None = None, **settings: bool) -> 
     found = verify_poses(poses, load, features=features, two_views=two_views, **settings)
     found.check()
     return found
+
+
+def model_of(poses: Poses, matches: Matches) -> PlacedModel:
+    return PlacedModel(pairs_of(*matches)).with_cameras(
+        {NAMES.index(name): pose for name, pose in poses.cameras.items()}
+    )
 
 
 def bytes_of(poses: Poses, name: str) -> bytes:
@@ -217,16 +223,16 @@ def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
 
 
 def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
-    model = model_of(displaced("2.png"), pairs_of(*matches))
+    model = model_of(displaced("2.png"), matches)
     before = dict(model.cameras)
-    found = correct_cameras(model, Confirmation(lambda image: (PICTURES[image], WHOLE)), fixed=[2])
+    after, found = correct_cameras(model, Confirmation(lambda image: (PICTURES[image], WHOLE)), fixed=[2])
     assert 2 in found.doubts
-    assert model.cameras[2] == before[2]
+    assert after.cameras[2] == before[2]
     assert not found.removed
 
 
 def test_judging_changes_nothing(matches: Matches) -> None:
-    model = model_of(displaced("2.png"), pairs_of(*matches))
+    model = model_of(displaced("2.png"), matches)
     before, chosen = dict(model.cameras), dict(model.chosen)
     found = check_cameras(model)
     assert model.cameras == before

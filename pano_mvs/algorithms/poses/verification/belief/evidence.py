@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
 FloatArray = NDArray[np.float64]
@@ -153,7 +152,7 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
     for edge, weight in model.pairs.learned_weights.items():
         if model.cameras.keys() >= {*edge}:
             view = (model.pairs.compared or {})[edge]
-            weights[edge] = weight if agrees_with(model, edge, view if view else view.alternatives[0]) else -weight
+            weights[edge] = weight if model.agrees_with(edge, view if view else view.alternatives[0]) else -weight
     if not weights:
         return {}, np.nan
     images = sorted({image for edge in weights for image in edge})
