@@ -108,18 +108,27 @@ def verify(
 
     Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
     confirm, and the share to be expected. These and the pairs give the probability that the camera is right. A doubtful
-    one is moved if another pose that its matches suggest is more probable, left out if it is surely wrong, or reported.
-    Without features and matches the stage only reports.
+    one is moved if the images confirm more of all cameras with another pose that its matches suggest, left out if it is
+    surely wrong, or reported. If most are doubtful, all are solved again from few pairs, and the images decide. Without
+    features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)
     )
-    for name in poses.names:
-        if name in verified.names and not np.array_equal(
-            poses.cam_from_world(poses.names.index(name)).center,
-            verified.cam_from_world(verified.names.index(name)).center,
-        ):
-            ctx.note(f"{name} was moved to another place, which is more probably right")
+    cameras = poses.cameras
+    moved = [
+        name
+        for name, camera in verified.cameras.items()
+        if name in cameras and not np.array_equal(cameras[name].center, camera.center)
+    ]
+    if 2 * len(moved) > len(verified.names):
+        ctx.note(
+            f"{len(moved)} cameras were placed again from few pairs: most pairs agree with other places, but there the "
+            "images confirm more of all cameras"
+        )
+    else:
+        for name in moved:
+            ctx.note(f"{name} was moved to another place, where the images confirm more of all cameras")
     return checked_poses(verified, ctx)
 
 

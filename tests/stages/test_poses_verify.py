@@ -59,7 +59,7 @@ def verified(
 @pytest.mark.slow
 def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
     poses = verified(tiny, ctx)
-    assert ctx.notes == [f"{WRONG} was moved to another place, which is more probably right"]
+    assert ctx.notes == [f"{WRONG} was moved to another place, where the images confirm more of all cameras"]
     assert poses.doubts == {}
     assert poses.points_in_world.shape[0] > 50
     truth = dict(zip(tiny.names, tiny.poses, strict=True))

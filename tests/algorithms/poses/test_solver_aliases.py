@@ -125,10 +125,14 @@ def _scrambled(view: TwoView, rng: np.random.Generator, *, count: int) -> TwoVie
     return replace(view, matches_idx=wrong, residuals_rad=view.residuals_rad[:count])
 
 
-def test_an_image_whose_pairs_contradict_one_another_is_rejected_or_doubted() -> None:
-    """Its five pairs put it in five places, and none of them has the truth."""
+def test_an_image_whose_pairs_contradict_one_another_has_a_rival_and_is_the_least_probable() -> None:
+    """Its five pairs put it in five places, and none of them has the truth; only images could decide."""
     capture = aliased_capture("contradicted", false=CONTRADICTED, with_truth=False)
-    assert judge_placements(solve(capture), capture.poses).unreported == ()
+    poses = solve(capture)
+    assert (judge_placements(poses, capture.poses).right == (np.array(poses.names) != "5.jpg")).all()
+    assert (poses.evidence["5.jpg"]["place_rival"] or 0) > 0.9
+    assert poses.right_probabilities is not None
+    assert poses.names[np.argmin(poses.right_probabilities)] == "5.jpg"
 
 
 def test_a_camera_whose_pairs_agree_on_a_false_place_is_the_one_thing_that_matches_cannot_tell() -> None:

@@ -66,7 +66,7 @@ def correct_cameras(
         before = model
         undecided = found.undecided = {*suspects}
         for image in suspects:
-            if found.compared < budget:
+            if found.compared < budget and len(model.cameras) > 2:
                 undecided.discard(image)
                 model = _at_best_place(model, image, confirmation, found, undecided)
         if model is not before:
@@ -98,8 +98,6 @@ def _at_best_place(
     The images refute other places if they confirm less of all cameras there. It moves to no place that points refuse.
     """
     others = {idx: camera for idx, camera in model.cameras.items() if idx != image}
-    if len(others) < 2:
-        return model
     without = model.with_cameras(others)
     evidence, places = without.place(image)
     shares = confirmation.shares(model.cameras)
@@ -107,7 +105,8 @@ def _at_best_place(
     refuted = []
     for place in places[:_MAX_PLACES]:
         pose, support, known = without.polished(image, evidence, place)
-        if is_same_place(pose, model.cameras, image):
+        # Minimum share of the best placement's score by matches, for a pose to be compared at all.
+        if place.score < 0.2 * places[0].score or is_same_place(pose, model.cameras, image):
             continue
         found.compared += 1
         moved = {**others, image: pose}
@@ -123,6 +122,17 @@ def _at_best_place(
         return model
     found.moved.add(image)
     return model.with_cameras(best)
+
+
+def images_decide(model: PlacedModel, confirmation: Confirmation, images: Collection[int]) -> bool:
+    """Return whether the images refute all other places of some images, of a model that is not changed."""
+    if len(model.cameras) < 3:
+        return not images
+    for image in sorted(images):
+        undecided: set[int] = set()
+        if _at_best_place(model, image, confirmation, CameraChecks(), undecided) is not model or undecided:
+            return False
+    return True
 
 
 def check_cameras(model: PlacedModel) -> CameraChecks:

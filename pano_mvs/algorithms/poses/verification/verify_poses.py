@@ -21,7 +21,7 @@ from pano_mvs.algorithms.poses.verification.arrangements import (
 )
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
-from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras
+from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras, images_decide
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -64,12 +64,11 @@ def verify_poses(
         return poses
     known = features is not None and all(name in features for name in poses.names)
     capture = _Capture(load, features if known and features else {}, two_views or {}, names=poses.names)
-    verified = _verified(poses, capture, correct=correct, miss_cost=miss_cost)
-    if correct and capture.pairs.compared and not poses.metric and _is_doubtful(verified, miss_cost=miss_cost):
-        other = _more_confirmed(verified, capture)
-        if other is not None:
-            verified = _verified(other, capture, correct=True, miss_cost=miss_cost)
-    return verified
+    if correct and capture.pairs.compared and not poses.metric:
+        checked = _verified(poses, capture, correct=False, miss_cost=miss_cost)
+        if _is_doubtful(checked, miss_cost=miss_cost) and not _images_decide(checked, capture):
+            poses = _more_confirmed(checked, capture) or poses
+    return _verified(poses, capture, correct=correct, miss_cost=miss_cost)
 
 
 class _Capture:
@@ -98,6 +97,11 @@ class _Capture:
         inside = {pair: view for pair, view in self.two_views.items() if {*pair} <= {*names}}
         return pairs_of(self.features, inside) if self.features else Pairs.without(self.names)
 
+    def model(self, group: Poses) -> PlacedModel:
+        """Return the cameras of a group, with the pairs among its images."""
+        cameras = {self.position[name]: pose for name, pose in group.cameras.items()}
+        return PlacedModel(self.pairs_among(group.names)).with_cameras(cameras)
+
 
 def _verified(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
     """Return poses whose groups are checked and corrected."""
@@ -107,10 +111,8 @@ def _verified(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: floa
 
 def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
     """Return poses of one group that are checked and corrected."""
-    pairs = capture.pairs_among(poses.names)
-    model = PlacedModel(pairs).with_cameras(
-        {capture.position[name]: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
-    )
+    model = capture.model(poses)
+    pairs = model.pairs
     fixed = () if correct and pairs.compared else [*model.cameras]
     model, checks = correct_cameras(model, capture.confirmation, fixed=fixed, miss_cost=miss_cost)
     if checks.moved or checks.removed:
@@ -123,6 +125,14 @@ def _is_doubtful(poses: Poses, *, miss_cost: float) -> bool:
     """Return whether an arrangement as a whole is doubtful: whether an average camera of it is."""
     known = poses.right_probabilities
     return known is not None and is_doubtful(float(np.nanmean(known)), miss_cost=miss_cost)
+
+
+def _images_decide(poses: Poses, capture: _Capture) -> bool:
+    """Return whether the images refute the other places of all doubtful cameras."""
+    return all(
+        images_decide(capture.model(group), capture.confirmation, [capture.position[name] for name in group.doubts])
+        for group in split_groups(poses)
+    )
 
 
 def _more_confirmed(poses: Poses, capture: _Capture) -> Poses | None:

@@ -42,11 +42,12 @@ def camera_evidence(
     Returns:
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
         `agreeing` (number of pairs that agree), `scale_worst` (largest |log ratio| of a distance between cameras to the
-        one that known points suggest), `place_rival` (weight of another place relative to its own), `repeats` (mean
-        weight of other geometries of the pairs of all cameras, relative to those in use), `linked` (weight of the
-        learned pairs that agree less that of those that do not, across the weakest cut between the camera and the
-        larger part of those with such pairs; see `weight_of_pair`), and `links_contradicting` (share of the weight of
-        all learned pairs of the model that does not agree with its cameras), for cameras with such.
+        one that known points suggest), `place_rival` (weight of
+        another place relative to its own), `repeats` (mean weight of other geometries of the pairs of all cameras,
+        relative to those in use), `linked` (weight of the learned pairs that agree less that of those that do not,
+        across the weakest cut between the camera and the larger part of those with such pairs; see `weight_of_pair`),
+        and `links_contradicting` (share of the weight of all learned pairs of the model that does not agree with its
+        cameras), for cameras with such.
     """
     refuted = refuted or {}
     repeats = _repeats(model, model.cameras if undecided is None else undecided)

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pano_mvs.algorithms.logistic import Model, Term
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.doubts import is_doubtful, is_left_out, reason
+from pano_mvs.algorithms.poses.verification.belief.doubts import (
+    is_doubtful,
+    is_left_out,
+    probability_of,
+    reason,
+    with_later_evidence,
+)
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Poses
 
 BEST = {
     "ratio": 1.2,
@@ -66,3 +76,34 @@ def test_another_arrangement_is_named_without_a_claim_that_the_images_cannot_dec
 def test_what_is_missing_is_said_as_such() -> None:
     found = reason(FITTED, dict.fromkeys(BEST, np.nan))
     assert "nan" not in found
+
+
+def poses_with(*probabilities: float) -> Poses:
+    cameras = {f"{idx}.png": Rigid3.from_center(np.eye(3), np.array([idx, 0.0, 0.0])) for idx in range(3)}
+    poses = Poses.without_points(cameras, frame="x", scale="x", metric=False)
+    return replace(poses, right_probabilities=np.array(probabilities)) if probabilities else poses
+
+
+def test_later_evidence_changes_the_probability_and_the_doubt_follows_from_it() -> None:
+    """Views that others contradict were doubtful by a rule, whatever else was known of their cameras."""
+    poses = poses_with(0.5, 0.9, 0.9999)
+    found = with_later_evidence(poses, {"1.png": (0.01, "other views contradict it"), "2.png": (0.01, "and it")})
+    assert found.right_probabilities is not None
+    np.testing.assert_allclose(found.right_probabilities, [0.5, 0.09 / 1.09, 99.99 / 100.99], rtol=1e-6)
+    assert set(found.doubts) == {"1.png"}
+    assert found.doubts["1.png"] == "its pose is right with a probability of 8 %: other views contradict it"
+    found.check()
+
+
+def test_a_camera_of_which_nothing_was_measured_starts_from_the_usual_share_of_right_ones() -> None:
+    usual = FITTED.probability({})
+    assert set(probability_of(poses_with()).values()) == {usual}
+    found = with_later_evidence(poses_with(), {"1.png": (0.5, "something")})
+    assert found.right_probabilities is not None
+    assert np.isnan(found.right_probabilities[[0, 2]]).all()
+    assert found.right_probabilities[1] == pytest.approx(usual / (2 - usual))
+
+
+def test_no_later_evidence_leaves_poses_as_they_are() -> None:
+    poses = poses_with(0.5, 0.9, 0.9)
+    assert with_later_evidence(poses, {"9.png": (0.1, "not of this group")}) is poses

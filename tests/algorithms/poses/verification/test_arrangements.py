@@ -1,0 +1,113 @@
+"""Arrangements are compared as wholes: what all cameras together confirm decides, not what the matches say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.algorithms.poses.verification.arrangements import (
+    SHARE_STD,
+    is_more_confirmed,
+    other_arrangements,
+    shares_of,
+)
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.correct_cameras import correct_cameras
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
+from tests.algorithms.room_pictures import WHOLE, Vector, moved, room_capture, room_matches
+from tools.benchmarks.belief.families import draw
+from tools.benchmarks.belief.measuring import matched
+from tools.benchmarks.poses.placements import judge_placements
+
+POSES, PICTURES = room_capture()
+AWAY: Vector = (0.5, 0.0, -0.4)
+
+
+def confirmation() -> Confirmation:
+    return Confirmation(lambda image: (PICTURES[image], WHOLE))
+
+
+def test_a_gain_counts_against_what_others_lose() -> None:
+    before = dict.fromkeys(range(5), 0.6)
+    assert is_more_confirmed({**before, 0: 0.8}, before)
+    assert not is_more_confirmed({**before, 0: 0.8, 1: 0.5, 2: 0.5}, before)
+    assert not is_more_confirmed(before, {**before, 0: 0.8})
+
+
+def test_a_gain_within_the_noise_of_the_cameras_that_changed_counts_as_none() -> None:
+    before = dict.fromkeys(range(100), 0.6)
+    one, all_of_them = ({**before, **dict.fromkeys(range(count), 0.6 + 1.5 * SHARE_STD)} for count in (1, 100))
+    assert not is_more_confirmed(one, before)
+    assert is_more_confirmed(all_of_them, before)
+    assert is_more_confirmed({**before, 0: 0.6 + 2.5 * SHARE_STD}, before)
+
+
+def test_a_camera_that_is_missing_or_cannot_be_judged_confirms_nothing() -> None:
+    both = {0: 0.6, 1: 0.6}
+    assert is_more_confirmed(both, {0: 0.6})
+    assert is_more_confirmed(both, {0: 0.6, 1: np.nan})
+    assert not is_more_confirmed({0: np.nan}, {})
+
+
+@pytest.mark.slow
+def test_true_poses_stay_where_most_matches_have_a_camera_elsewhere() -> None:
+    """Regression: in a hall with a tiled floor, false matches moved two of nine right cameras."""
+    features, two_views = room_matches({2: AWAY}, false=120)
+    model = PlacedModel(pairs_of(features, two_views)).with_cameras(dict(enumerate(POSES)))
+    corrected, checks = correct_cameras(model, confirmation())
+    assert not checks.moved
+    assert not checks.removed
+    assert corrected.cameras == model.cameras
+
+
+@pytest.mark.slow
+def test_the_images_refute_the_place_that_most_matches_suggest() -> None:
+    """A refuted place is no rival: right cameras of repeating places were doubted because of such."""
+    features, two_views = room_matches({2: AWAY}, false=120)
+    model = PlacedModel(pairs_of(features, two_views)).with_cameras(dict(enumerate(POSES)))
+    _, checks = correct_cameras(model, confirmation())
+    _, reported = correct_cameras(model, confirmation(), fixed=range(len(POSES)))
+    assert reported.evidence[2]["place_rival"] > 0
+    assert checks.evidence[2]["place_rival"] == 0
+    assert checks.p_right[2] > reported.p_right[2]
+    feigned = moved(POSES[2], AWAY)
+    assert min(np.linalg.norm(pose.center - feigned.center) for pose in checks.refuted[2]) < 0.1
+
+
+def test_shares_of_groups_are_those_of_each_group() -> None:
+    cameras = dict(enumerate(POSES))
+    groups = [{0: cameras[0], 1: cameras[1]}, {2: cameras[2], 3: cameras[3], 4: cameras[4]}]
+    shares = shares_of(groups, confirmation())
+    assert set(shares) == set(cameras)
+    assert shares[3] == confirmation().evidence(3, cameras[3], groups[1], independent=False).share
+
+
+@pytest.mark.slow
+def test_a_capture_is_solved_again_from_few_pairs_if_the_images_confirm_more() -> None:
+    """Regression: four views of a hall fell into two groups, since false pairs of distant views outvoted right ones."""
+    capture = draw("hall", 9101)
+    features, two_views = matched(capture, learned=False)
+
+    def load(name: str) -> Picture:
+        return capture.pictures[name], np.ones(capture.pictures[name].shape[:2], np.bool_)
+
+    solved = solve_scaled_translation(features, two_views, load=load, rng=np.random.default_rng(1))
+    found = verify_poses(solved, load, features=features, two_views=two_views)
+    placed = judge_placements(found, capture.truth)
+    assert len(found.worlds) == 1
+    assert placed.right.sum() == 4
+    assert not placed.doubted.any()
+
+
+def test_arrangements_come_from_neighbours_in_the_order_of_capture_and_from_the_strongest_pairs() -> None:
+    features, two_views = room_matches()
+    pairs = pairs_of(features, two_views)
+    found = list(other_arrangements(features, two_views, pairs))
+    assert found
+    for models in found:
+        assert all(model.pairs is pairs for model in models)
+        assert {image for model in models for image in model.cameras} <= {*range(len(POSES))}
+    largest = max((model for models in found for model in models), key=lambda model: len(model.cameras))
+    assert len(largest.cameras) == len(POSES)
