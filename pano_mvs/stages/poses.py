@@ -109,8 +109,8 @@ def verify(
     Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
     confirm, and the share to be expected. These and the pairs give the probability that the camera is right. A doubtful
     one is moved if the images confirm more of all cameras with another pose that its matches suggest, left out if it is
-    surely wrong, or reported. If most are doubtful, all are solved again from few pairs, and the images decide. Without
-    features and matches the stage only reports.
+    surely wrong, or reported. If the images do not refute the other poses, all are solved again from few pairs, and the
+    images decide. Without features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)

@@ -19,7 +19,7 @@ from pano_mvs.algorithms.poses.verification.arrangements import (
     settled,
     shares_of,
 )
-from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful
+from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras, images_decide
 from pano_mvs.core.settings import Setting, checks_settings
@@ -44,9 +44,10 @@ def verify_poses(
     """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
     Every camera is swept with its neighbours at 256 columns. All measurements together give the probability that each
-    camera is right (`docs/method.md`). One that is more probably wrong than its cost allows is moved to the pose that
-    is most probable of all that its pairs suggest. If it still is, it is doubted, or left out if it is as surely wrong
-    as others are right.
+    camera is right (`docs/method.md`). If the images do not refute the other places of doubtful cameras, the capture is
+    solved again from few pairs, and the arrangement that the images confirm most is kept. Then each doubtful camera is
+    moved to the place with which all cameras are confirmed most. If it is doubtful still, it is reported, or left out
+    if it is as surely wrong as others are right.
 
     Args:
         poses: of any origin. Cameras that are not moved keep their poses exactly.
@@ -58,7 +59,8 @@ def verify_poses(
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares`, `evidence`, `right_probabilities` and `doubts`. Points are
-        triangulated again if a camera was moved or left out.
+        triangulated again if a camera was moved or left out. After another solution, frame and
+        unit are its own.
     """
     if len(poses.names) < 2:
         return poses
@@ -66,7 +68,7 @@ def verify_poses(
     capture = _Capture(load, features if known and features else {}, two_views or {}, names=poses.names)
     if correct and capture.pairs.compared and not poses.metric:
         checked = _verified(poses, capture, correct=False, miss_cost=miss_cost)
-        if _is_doubtful(checked, miss_cost=miss_cost) and not _images_decide(checked, capture):
+        if not _images_decide(checked, capture):
             poses = _more_confirmed(checked, capture) or poses
     return _verified(poses, capture, correct=correct, miss_cost=miss_cost)
 
@@ -119,12 +121,6 @@ def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost
         moved = replace(poses_of(model), **poses.worlds[0]._asdict())
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     return with_camera_checks(poses, pairs, checks)
-
-
-def _is_doubtful(poses: Poses, *, miss_cost: float) -> bool:
-    """Return whether an arrangement as a whole is doubtful: whether an average camera of it is."""
-    known = poses.right_probabilities
-    return known is not None and is_doubtful(float(np.nanmean(known)), miss_cost=miss_cost)
 
 
 def _images_decide(poses: Poses, capture: _Capture) -> bool:
