@@ -142,7 +142,10 @@ class _Wirer:
                 self._problem(entry, "use", self._missing(entry, port))
             return None
         nearest = candidates[-1]
-        others = [stage.name for stage in candidates[:-1] if stage.name not in self.ancestors.get(nearest.name, set())]
+        # What a stage takes by name has its purpose, such as a first solution that only serves to choose pairs.
+        named = {name for stage in self.stages.values() for name in stage.policy.inputs.values()}
+        before = self.ancestors.get(nearest.name, set()) | named
+        others = [stage.name for stage in candidates[:-1] if stage.name not in before]
         if others:
             options = ", ".join([*others, nearest.name])
             self._problem(

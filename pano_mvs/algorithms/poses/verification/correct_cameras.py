@@ -68,7 +68,7 @@ def correct_cameras(
         for image in suspects:
             if found.compared < budget and len(model.cameras) > 2:
                 undecided.discard(image)
-                model = _at_best_place(model, image, confirmation, found, undecided)
+                model = _at_best_place(model, image, confirmation, found=found, undecided=undecided)
         if model is not before:
             found.links_contradicting = np.nan
             found.refuted.clear()
@@ -91,7 +91,7 @@ def _suspects(found: CameraChecks, *, fixed: Collection[int], miss_cost: float) 
 
 
 def _at_best_place(
-    model: PlacedModel, image: int, confirmation: Confirmation, found: CameraChecks, undecided: set[int]
+    model: PlacedModel, image: int, confirmation: Confirmation, *, found: CameraChecks, undecided: set[int]
 ) -> PlacedModel:
     """Return the model with an image where all cameras together are confirmed most, of the places its pairs suggest.
 
@@ -130,7 +130,8 @@ def images_decide(model: PlacedModel, confirmation: Confirmation, images: Collec
         return not images
     for image in sorted(images):
         undecided: set[int] = set()
-        if _at_best_place(model, image, confirmation, CameraChecks(), undecided) is not model or undecided:
+        best = _at_best_place(model, image, confirmation, found=CameraChecks(), undecided=undecided)
+        if best is not model or undecided:
             return False
     return True
 

@@ -104,7 +104,7 @@ def _of_pairs(model: PlacedModel, image: int, refuted: Sequence[Rigid3]) -> Row:
     return {
         "agreeing": float(len(edges)),
         "scale_worst": float(errors.max()) if len(errors) else np.nan,
-        "place_rival": _place_rival(model, image, own, refuted),
+        "place_rival": _place_rival(model, image, own, refuted=refuted),
     }
 
 
@@ -116,7 +116,7 @@ def _scale_errors(model: PlacedModel, image: int, edges: Sequence[Edge]) -> Floa
     return np.asarray(np.abs(np.log(evidence.lengths[known] / actual[known])))
 
 
-def _place_rival(model: PlacedModel, image: int, own: float, refuted: Sequence[Rigid3]) -> float:
+def _place_rival(model: PlacedModel, image: int, own: float, *, refuted: Sequence[Rigid3]) -> float:
     """Return the weight of the best other place that the pairs of a camera suggest, relative to its own.
 
     Places that the images refute are not counted.
