@@ -193,6 +193,13 @@ def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired: Wire
     assert producers(graph, "c") == {"xs": ("b", False)}
 
 
+def test_a_value_that_another_stage_takes_by_name_is_no_candidate_beside_the_nearest(wired: Wire) -> None:
+    """Regression: a stage in front of the refinement made presets ambiguous that solve poses twice."""
+    side = SOURCE + "  a: {use: toy.scale}\n  t: {use: toy.total, in: {xs: a}}\n  b: {use: toy.scale, in: {x: i}}\n"
+    assert producers(wired(side + "  c: {use: toy.total}\n"), "c") == {"xs": ("b", False)}
+    assert producers(wired(side + "  d: {use: toy.scale}\n  c: {use: toy.total}\n"), "c") == {"xs": ("d", False)}
+
+
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
