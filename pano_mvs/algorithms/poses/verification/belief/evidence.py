@@ -50,7 +50,8 @@ def camera_evidence(
         cameras), for cameras with such.
     """
     refuted = refuted or {}
-    repeats = _repeats(model, model.cameras if undecided is None else undecided)
+    # Other geometries of pairs lead to other places; they do not count once the images refute all of these.
+    repeats = _repeats(model) if undecided is None or undecided else 0.0
     linked, links_contradicting = _links(model)
     links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
@@ -77,16 +78,11 @@ def _has_certain_pair(model: PlacedModel, image: int) -> bool:
     )
 
 
-def _repeats(model: PlacedModel, undecided: Collection[int]) -> float:
-    """Return the mean weight of other geometries of pairs, relative to those in use.
-
-    Other geometries would put one of the two images elsewhere. They do not count if this is decided for both.
-    """
+def _repeats(model: PlacedModel) -> float:
     of_cameras: dict[int, list[tuple[float, int]]] = {}
     for edge, rank in model.chosen.items():
         found = model.pairs.geometries[edge]
-        rivals = (other.weight for number, other in enumerate(found) if number != rank)
-        rival = max(rivals, default=0.0) if {*edge} & {*undecided} else 0.0
+        rival = max((other.weight for number, other in enumerate(found) if number != rank), default=0.0)
         for image in edge:
             of_cameras.setdefault(image, []).append((rival / max(found[rank].weight, 1e-9), len(found[rank].view)))
     means = [
