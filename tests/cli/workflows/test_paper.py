@@ -45,7 +45,7 @@ def faithful(capture: Path, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_workflow_can_say_what_the_paper_does(faithful: Path, tmp_path: Path, pano_mvs: Command) -> None:
     outcome = pano_mvs("run", faithful, "--out", tmp_path / "out")
-    assert outcome.code == 0, outcome.text
+    assert outcome.code in (0, 3), outcome.text  # 3: the paper's poses are not adjusted, so one may be doubtful
     summary = run_json(tmp_path / "out")
     found = np.array(summary["poses"]["centers"])
     true = np.array([pose.center for pose in capture_poses(4, spread=0.4)])
@@ -71,7 +71,7 @@ def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
             *FEW_PLANES,
             *options,
         )
-        assert result.code == 0, result.text
+        assert result.code in (0, 3), result.text  # 3: a pose that is not adjusted may be doubtful
         return run_json(Path(out))
 
     return call

@@ -9,7 +9,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.growth import settle
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.solved_models import solved_models
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, TwoView
 
@@ -21,8 +21,14 @@ Pair = tuple[str, str]
 
 
 def shares_of(groups: Iterable[Mapping[int, Rigid3]], confirmation: Confirmation) -> dict[int, float]:
-    """Return the confirmed share of every camera of some groups, NaN where too little can be judged."""
-    return {image: share for cameras in groups for image, share in confirmation.shares(cameras).items()}
+    """Return the confirmed share of every camera of some groups, NaN where too little can be judged.
+
+    In small groups, each camera is confirmed by maps that are swept without it: in shared ones it would confirm itself.
+    """
+    shares: dict[int, float] = {}
+    for cameras in groups:
+        shares |= confirmation.shares(cameras, independent=len(cameras) < SHARED_FROM)
+    return shares
 
 
 def is_more_confirmed(shares: Mapping[int, float], before: Mapping[int, float]) -> bool:

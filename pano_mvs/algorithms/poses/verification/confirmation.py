@@ -25,6 +25,8 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 WIDTH_PX = 256
 _SETTINGS = SURFACE_SETTINGS.replace(planes=64, spacing="inverse")
 _SOURCES = 4
+SHARED_FROM = 8
+"""With this number of cameras or more, a model is judged by sweeps that its cameras share."""
 # With less textured area than this share of the sphere, nothing can be concluded about a pose.
 MIN_TEXTURED = 0.05
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
@@ -90,13 +92,13 @@ class Confirmation:
         self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], RangeMap]]] = OrderedDict()
         self._evidence_of: dict[tuple[tuple[int, ...], ...], list[tuple[list[Rigid3], Evidence]]] = {}
 
-    def shares(self, cameras: Mapping[int, Rigid3]) -> dict[int, float]:
-        """Return the share of every camera of a model, with one sweep for each; see `evidence`.
+    def shares(self, cameras: Mapping[int, Rigid3], *, independent: bool = False) -> dict[int, float]:
+        """Return the share of every camera of a model, by default with one sweep for each; see `evidence`.
 
         What two models have in common is computed once.
         """
         return {
-            image: self.evidence(image, pose, cameras, independent=False).share
+            image: self.evidence(image, pose, cameras, independent=independent).share
             for image, pose in sorted(cameras.items())
         }
 

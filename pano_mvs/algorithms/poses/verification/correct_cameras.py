@@ -14,7 +14,7 @@ from pano_mvs.algorithms.poses.verification.arrangements import is_more_confirme
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence, is_same_place
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation, nearest_cameras
 from pano_mvs.geometry import Rigid3
 
 _MAX_PLACES = 4  # number of places of an image that are compared, as many as a camera has neighbours in a small sweep
@@ -150,8 +150,8 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
     In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
     again by sweeps of their neighbours without them.
     """
-    # With this many cameras or more, the first pass uses shared sweeps; a second one follows below this expected share.
-    shared = len(model.cameras) >= 8
+    # The first pass uses shared sweeps; a second one follows below this expected share.
+    shared = len(model.cameras) >= SHARED_FROM
     evidence = {
         image: confirmation.evidence(image, pose, model.cameras, independent=not shared)
         for image, pose in sorted(model.cameras.items())

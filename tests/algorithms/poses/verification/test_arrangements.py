@@ -81,7 +81,7 @@ def test_shares_of_groups_are_those_of_each_group() -> None:
     groups = [{0: cameras[0], 1: cameras[1]}, {2: cameras[2], 3: cameras[3], 4: cameras[4]}]
     shares = shares_of(groups, confirmation())
     assert set(shares) == set(cameras)
-    assert shares[3] == confirmation().evidence(3, cameras[3], groups[1], independent=False).share
+    assert shares[3] == confirmation().evidence(3, cameras[3], groups[1]).share
 
 
 @pytest.mark.slow
