@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pano_mvs.cli import inspect_command as inspect_text
+from pano_mvs.engine.cache.packs import RECORD
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.evaluation.ranges import tables as depth_tables
 from pano_mvs.results.figures import figure
 from tests.cli.conftest import SMALL, deliverables
@@ -24,11 +26,12 @@ WAYS = {
 
 
 def stored(folder: Path) -> dict[str, object]:
-    """Return the records of a store without their times."""
-    found = {}
-    for path in (folder / "records").rglob("*.json"):
-        found[path.name] = json.loads(path.read_bytes().partition(b"\n")[2]) | {"seconds": 0}
-    return found
+    """Return the records of a store without their times, whether they have files of their own or are in packs."""
+    store = Store(folder)
+    keys = {path.stem for path in (folder / "records").rglob("*.json")}
+    keys |= {packed.digest for packed in store.blobs.packs.each() if packed.kind == RECORD}
+    records = {key: store.read_record(key) for key in sorted(keys)}
+    return {key: record and replace(record, seconds=0.0) for key, record in records.items()}
 
 
 @pytest.mark.slow
@@ -48,6 +51,7 @@ def test_all_executors_give_the_same_bytes(rendered: Path, tmp_path: Path) -> No
         assert done.returncode == 0, done.stdout + done.stderr
         assert deliverables(tmp_path / f"out-{name}") == deliverables(tmp_path / "out-serial"), name
         assert stored(tmp_path / f"cache-{name}") == stored(tmp_path / "cache-serial"), name
+    assert len(stored(tmp_path / "cache-serial")) > 20
     assert len(deliverables(tmp_path / "out-serial")) > 10
 
 
