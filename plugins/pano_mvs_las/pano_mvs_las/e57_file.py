@@ -15,6 +15,7 @@ from pano_mvs.api import CHUNK_POINTS, KeptPoints, Panorama, PointCloud, Rigid3,
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
+from pano_mvs_las.e57_panoramas import CAM_FROM_IMAGE
 from pano_mvs_las.las_file import bounds
 from pano_mvs_las.placement import Placement
 
@@ -23,8 +24,6 @@ _COLORS = ("colorRed", "colorGreen", "colorBlue")
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _NAMESPACE = uuid.UUID("6c1f3a52-6d0e-4c43-9d6a-0c5f4a3c8c11")
-# E57's camera has x forward, y left and z up (8.4.14.4 of the standard); ours x right, y down and z forward.
-_CAM_FROM_IMAGE = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ def _write_panorama(file: libe57.ImageFile, placed: PlacedPanorama, placement: P
     for name, text in {"guid": f"{{{guid}}}", "name": placed.name, "sensorVendor": "pano_mvs"}.items():
         image.set(name, libe57.StringNode(file, text))
     center = placed.cam_from_world.center
-    file_from_image = placement.rotation_at(center) @ placed.cam_from_world.rotation.T @ _CAM_FROM_IMAGE
+    file_from_image = placement.rotation_at(center) @ placed.cam_from_world.rotation.T @ CAM_FROM_IMAGE
     x, y, z, w = Rotation.from_matrix(file_from_image).as_quat().tolist()
     sign = -1.0 if w < 0 else 1.0  # the standard wants w ≥ 0
     pose = libe57.StructureNode(file)

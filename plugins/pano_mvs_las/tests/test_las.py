@@ -25,10 +25,13 @@ from pano_mvs.api import (
 from pano_mvs.io import point_selection
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+from pye57 import libe57
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from pano_mvs_las import e57, las
+from pano_mvs_las import e57, las, poses_e57, source_e57
+from pano_mvs_las.e57_panoramas import list_panoramas
+from pano_mvs_las.sources import PosesParams, SourceParams, list_items
 from pano_mvs_las.stages import CloudParams, E57Params, LasParams
 
 HERE = (47.5, 8.25, 410.0)
@@ -271,3 +274,181 @@ def test_panoramas_of_an_e57_file_are_optional_and_the_same_each_time(tmp_path: 
     bare = bytes_of("c", CAPTURE.images, E57Params(panoramas=False))
     assert bare == bytes_of("d", None, E57Params())
     assert len(whole) > len(bare) + 4 * 3000
+
+
+CAMERAS = dict(zip(CAPTURE.names, CAPTURE.poses, strict=True))
+
+
+def a_file(folder: Path, origin_lla: tuple[float, float, float] | None) -> Path:
+    """Write the masked panoramas of a capture as E57."""
+    folder.mkdir()
+    ctx = Context(np.random.default_rng(0), folder)
+    (path,) = e57(in_pictures(0)[1], placed(CAMERAS, origin_lla), CAPTURE.images, E57Params(), ctx).files.values()
+    return Path(path)
+
+
+def read_back(path: Path, folder: Path) -> dict[str, Panorama]:
+    params = SourceParams(path=path)
+    images = {}
+    for item in list_items(params):
+        (folder / item.name).mkdir(parents=True)
+        images[item.name] = source_e57(item, params, Context(np.random.default_rng(0), folder / item.name))
+    return images
+
+
+@pytest.mark.parametrize("origin_lla", [None, HERE], ids=["upright", "on a map"])
+def test_panoramas_and_poses_come_back_out_of_an_e57_file(
+    tmp_path: Path, origin_lla: tuple[float, float, float] | None
+) -> None:
+    path = a_file(tmp_path / "out", origin_lla)
+    images = read_back(path, tmp_path / "in")
+    assert list(images) == [f"{Path(name).stem}.jpg" for name in CAPTURE.names]
+    for name, own in zip(images, CAPTURE.names, strict=True):
+        np.testing.assert_array_equal(images[name].load_mask(), CAPTURE.images[own].load_mask())
+        shown = CAPTURE.images[own].load_mask()
+        apart = np.abs(images[name].load().astype(int) - CAPTURE.images[own].load())[shown]
+        assert apart.mean() < 6
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    poses = poses_e57(images, PosesParams(path=path), ctx)
+    assert poses.metric
+    true = np.array([pose.center for pose in CAPTURE.poses])
+    found = poses.centers
+    np.testing.assert_allclose(
+        np.linalg.norm(found[1:] - found[0], axis=1), np.linalg.norm(true[1:] - true[0], axis=1), rtol=1e-3
+    )
+    for idx, other in ((0, 1), (1, 2)):
+        turn = poses.rotations[other] @ poses.rotations[idx].T
+        expected = CAPTURE.poses[other].rotation @ CAPTURE.poses[idx].rotation.T
+        np.testing.assert_allclose(turn, expected, atol=1e-3)
+        ahead = poses.rotations[idx] @ (found[other] - found[idx])
+        np.testing.assert_allclose(
+            ahead, CAPTURE.poses[idx].rotation @ (true[other] - true[idx]), atol=1e-3 if origin_lla else 1e-6
+        )
+    assert np.abs(poses.centers).max() < 10_000
+    assert ("minus (" in poses.frame) == (origin_lla is not None)
+
+
+def sphere(picture: np.ndarray, **changes: Any) -> dict[str, Any]:
+    height, width = picture.shape[:2]
+    stated = {
+        "imageWidth": width,
+        "imageHeight": height,
+        "pixelWidth": 2 * np.pi / width,
+        "pixelHeight": np.pi / height,
+        "pngImage": cv2.imencode(".png", picture[..., ::-1])[1].tobytes(),
+    }
+    return {name: value for name, value in (stated | changes).items() if value is not None}
+
+
+def pose_at(x: float, y: float = 0.0, z: float = 0.0) -> dict[str, Any]:
+    return {"rotation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}, "translation": {"x": x, "y": y, "z": z}}
+
+
+def file_of(path: Path, images: list[dict[str, Any]]) -> Path:
+    """Write images, given by the values of their nodes, as other programs might."""
+    file = libe57.ImageFile(str(path), "w")
+    file.extensionsAdd("", libe57.E57_V1_0_URI)
+    blobs: list[tuple[Any, bytes]] = []
+    nodes = libe57.VectorNode(file, True)
+    file.root().set("images2D", nodes)
+    for image in images:
+        node = libe57.StructureNode(file)
+        nodes.append(node)
+        fill(file, node, image, blobs)
+    for node, data in blobs:
+        node.write(data, 0, len(data))
+    file.close()
+    return path
+
+
+def fill(file: Any, node: Any, values: dict[str, Any], blobs: list[tuple[Any, bytes]]) -> None:
+    simple = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            node.set(name, child := libe57.StructureNode(file))
+            fill(file, child, value, blobs)
+        elif isinstance(value, bytes):
+            node.set(name, child := libe57.BlobNode(file, len(value)))
+            blobs.append((child, value))
+        else:
+            node.set(name, simple[type(value)](file, value))
+
+
+PICTURE = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
+
+
+def test_what_an_e57_file_does_not_say_is_unknown(tmp_path: Path) -> None:
+    """No names, the same names, names that are no file names, no pose, and images of other kinds."""
+    path = file_of(
+        tmp_path / "scan.e57",
+        [
+            {"sphericalRepresentation": sphere(PICTURE), "pose": pose_at(0.0)},
+            {"name": "a/b: 1", "sphericalRepresentation": sphere(PICTURE), "pose": pose_at(1.0)},
+            {"name": "c.png", "sphericalRepresentation": sphere(PICTURE)},
+            {"name": "c.png", "sphericalRepresentation": sphere(PICTURE), "pose": pose_at(2.0)},
+            {"name": "cam 0", "pinholeRepresentation": {"imageWidth": 4}},
+        ],
+    )
+    items = list(list_items(SourceParams(path=path)))
+    assert [item.name for item in items] == ["image_0000.png", "a_b_ 1.png", "c.png", "c_0003.png"]
+    note = "scan.e57: 1 image of a pinhole camera is not used: only spherical images are panoramas"
+    assert all(item.notes == (note,) for item in items)
+    images = read_back(path, tmp_path / "in")
+    np.testing.assert_array_equal(images["c.png"].load(), PICTURE)
+    assert images["c.png"].crop_ltwh is None
+    poses = poses_e57(images, PosesParams(path=path), Context(np.random.default_rng(0), tmp_path))
+    assert poses.names == ("image_0000.png", "a_b_ 1.png", "c_0003.png")
+    assert poses.rejected == {"c.png": "scan.e57 has no pose of it"}
+    np.testing.assert_allclose(poses.centers, [[0, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-12)
+    # The middle of the picture, our z axis, is the x axis of the image, and up is up.
+    np.testing.assert_allclose(poses.rotations[0].T @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(poses.rotations[0].T @ [0, -1, 0], [0, 0, 1], atol=1e-12)
+
+
+def test_a_part_of_the_sphere_is_around_the_middle(tmp_path: Path) -> None:
+    part = sphere(PICTURE[16:48], pixelHeight=2 * np.pi / 128)
+    images = [{"sphericalRepresentation": part, "pose": pose_at(float(idx))} for idx in range(2)]
+    panorama = read_back(file_of(tmp_path / "scan.e57", images), tmp_path / "in")["image_0000.png"]
+    assert panorama.crop_ltwh == (0, 16, 128, 32)
+    mask = panorama.load_mask()
+    assert mask[17:47].all()
+    assert not mask[:16].any()
+    assert not mask[48:].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"imageWidth": None}, "imageWidth is missing"),
+        ({"pixelWidth": 0.0}, "its size is 128×64 px of 0×"),
+        ({"pixelWidth": 0.2}, "no part of an equirectangular panorama"),
+        ({"pngImage": None}, "neither a JPEG nor a PNG"),
+    ],
+)
+def test_an_image_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any], problem: str) -> None:
+    images = [{"name": "a", "sphericalRepresentation": sphere(PICTURE, **changes)}]
+    with pytest.raises(InputError, match=problem):
+        list_panoramas(file_of(tmp_path / "scan.e57", images))
+
+
+def test_files_without_panoramas_or_poses_say_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "text.e57").write_text("no")
+    with pytest.raises(InputError, match=r"text.e57: cannot be read as E57"):
+        list_panoramas(tmp_path / "text.e57")
+    cameras = file_of(tmp_path / "scan.e57", [{"pinholeRepresentation": {"imageWidth": 4}}] * 6)
+    with pytest.raises(InputError, match=r"contains 0 spherical images; .* 6 images of a pinhole camera are not used"):
+        list(list_items(SourceParams(path=cameras)))
+    bare = file_of(tmp_path / "bare.e57", [{"sphericalRepresentation": sphere(PICTURE)}] * 2)
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    with pytest.raises(InputError, match="has poses of 0 images of this capture"):
+        poses_e57(read_back(bare, tmp_path / "in"), PosesParams(path=bare), ctx)
+    same = {"sphericalRepresentation": sphere(PICTURE), "pose": pose_at(1.0)}
+    still = file_of(tmp_path / "still.e57", [same, same])
+    with pytest.raises(InputError, match="all 2 panoramas are in the same place"):
+        poses_e57(read_back(still, tmp_path / "again"), PosesParams(path=still), ctx)
+    turned = {
+        "sphericalRepresentation": sphere(PICTURE),
+        "pose": {"rotation": {"w": 0.0, "x": 0.0, "y": 0.0, "z": 0.0}},
+    }
+    with pytest.raises(InputError, match="a quaternion of length 0"):
+        list_panoramas(file_of(tmp_path / "turned.e57", [turned]))
