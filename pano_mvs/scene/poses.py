@@ -119,7 +119,7 @@ class Poses(Record):
             confirm in a small sweep with these poses; NaN where too few pixels can be judged; None if not computed.
         expected_shares: (N,) float64 the expected share, from the neighbouring cameras.
         right_probabilities: (N,) float64 probability that each pose is right, by all that was measured about it; NaN
-            where nothing was; None if not computed, or if the images turned out not to be full spheres.
+            where nothing was; None if not computed.
         evidence: name of each image to what was measured for and against its pose, by measurement; None where it is
             missing. `pano_mvs.algorithms.poses.verification.belief.evidence` says what is measured.
         doubts: name of every registered image whose pose is doubtful, with the reason.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -193,10 +194,14 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
     """
     poses, stage = _judged_poses(run)
     if poses is not None and stage:
-        for image in poses.doubts.keys() - run.result.doubts.keys():
-            run.result.doubts[image] = stage, poses.doubts[image]
-    if run.result.doubts and run.result.exit_code == 0:
-        run.result.exit_code = FAILED_ITEMS
+        for image in poses.names:
+            doubt = poses.doubts.get(image)
+            if doubt and run.result.doubts.get(image, ("", ""))[1] != doubt:
+                run.result.doubts[image] = stage, doubt
+    if poses is not None:
+        _admit_placed(run, {*poses.names})
+    if run.result.exit_code in (0, FAILED_ITEMS) and not run.result.stopped:
+        run.result.exit_code = FAILED_ITEMS if run.result.doubts or not run.result.complete else 0
     summary = summarise(run, poses, started=started, seconds=time.perf_counter() - clock)
     values = StoredValues.of_run(run, summary.results)
     try:
@@ -206,6 +211,14 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
         summary.write(run.out)
     write_page(run.out, summary, report)
     return summary, values
+
+
+def _admit_placed(run: Run, names: Collection[str]) -> None:
+    """Forget that a stage of poses left out images that a later one placed."""
+    stages = chain_of(run.workflow, run.graph, Poses)
+    for image, (stage, _) in list(run.result.rejected.items()):
+        if image in names and stage in stages:
+            del run.result.rejected[image]
 
 
 def write_outputs_after_error(run: Run, error: BaseException, *, started: datetime, clock: float) -> None:

@@ -121,14 +121,13 @@ def verify(
         for name, camera in verified.cameras.items()
         if name in cameras and not np.array_equal(cameras[name].center, camera.center)
     ]
-    if 2 * len(moved) > len(verified.names):
-        ctx.note(
-            f"{len(moved)} cameras were placed again from few pairs: most pairs agree with other places, but there the "
-            "images confirm more of all cameras"
-        )
-    else:
-        for name in moved:
-            ctx.note(f"{name} was moved to another place, where the images confirm more of all cameras")
+    for what, found in (
+        ("moved to another place", moved),
+        ("placed", [name for name in verified.names if name not in cameras]),
+    ):
+        if found:
+            were = plural(len(found), "was", "were")
+            ctx.note(f"{shortened_list(found)} {were} {what}, where the images confirm more of all cameras")
     return checked_poses(verified, ctx)
 
 

@@ -7,15 +7,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import maximum_flow
+from scipy.sparse.csgraph import breadth_first_order
 
 from pano_mvs.algorithms.matching.pair_selection import similarities
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
+from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView, WeakImages
 from pano_mvs.scene.pose_groups import split_groups
-
-_DETERMINED_BY = 2  # pairs: one leaves the distance open, two give ten equations for six unknowns
 
 
 @checks_settings
@@ -73,24 +72,38 @@ def _firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, 
         for (first, second), view in matches.items()
         if view and place.keys() >= {first, second} and model.agrees_with((place[first], place[second]), view)
     ]
-    firm = _firmly_connected(edges, len(names), at_least=min(_DETERMINED_BY, count - 1))
+    # One pair leaves the distance open, two give ten equations for six unknowns; two images have one pair at most.
+    firm = _largest(edges if count == 2 else _without_bridges(edges, len(names)), len(names))
     return {names[idx] for idx in firm} if 2 * len(firm) > count else set()
 
 
-def _firmly_connected(edges: Collection[tuple[int, int]], count: int, *, at_least: int) -> set[int]:
-    """Return the largest set of nodes, any two of which are connected by `at_least` paths without a common edge.
+def _largest(edges: Collection[tuple[int, int]], count: int) -> list[int]:
+    return max(connected_groups(edges, count), key=len, default=[])
 
-    By Menger's theorem, every cut between two of them then has at least this number of edges.
+
+def _without_bridges(edges: Collection[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Return the edges of a graph that are on a cycle: what they connect, no single edge separates.
+
+    Each edge outside a spanning tree gets a random number. Those that pass a cut of the tree are the ones that begin on
+    one side of it: the exclusive or of the numbers at the nodes below it is 0 only if there are none.
     """
-    ends = np.array(edges, np.intp).reshape(-1, 2)
-    both = np.concatenate([ends, ends[:, ::-1]]).T
-    graph = csr_array(coo_array((np.ones(both.shape[1], np.int32), both), (count, count)))
-    degree = graph.sum(axis=0)
-    left, largest = set(range(count)), set[int]()
-    while len(left) > len(largest):
-        root = max(left, key=lambda node: (degree[node], -node))
-        others = (node for node in sorted(left - {root}) if degree[node] >= at_least)
-        found = {root, *(node for node in others if maximum_flow(graph, root, node).flow_value >= at_least)}
-        largest = max(largest, found, key=len)
-        left -= found
-    return largest
+    ends = np.array(sorted({(min(edge), max(edge)) for edge in edges}), np.intp).reshape(-1, 2)
+    graph = csr_array(coo_array((np.ones(len(ends), np.int8), ends.T), (count, count)))
+    above = np.full(count, -1)
+    below: list[int] = []
+    seen = np.zeros(count, np.bool_)
+    for root in range(count):
+        if not seen[root]:
+            order, before = breadth_first_order(graph, root, directed=False)
+            seen[order] = True
+            above[order[1:]] = before[order[1:]]
+            below += order[1:].tolist()
+    in_tree = (above[ends[:, 0]] == ends[:, 1]) | (above[ends[:, 1]] == ends[:, 0])
+    numbers = np.random.default_rng(0).integers(1, 2**63, len(ends))
+    passing = np.zeros(count, np.int64)
+    for edge, number in zip(ends[~in_tree], numbers[~in_tree], strict=True):
+        passing[edge] ^= number
+    for node in reversed(below):
+        passing[above[node]] ^= passing[node]
+    bridges = {tuple(sorted((node, int(above[node])))) for node in below if not passing[node]}
+    return [(int(a), int(b)) for a, b in ends if (int(a), int(b)) not in bridges]

@@ -315,7 +315,7 @@ class _Overrides:
         stages, problems = self.stages, self.problems
         stage = _stage_of(override.target, stages)
         is_plugin, is_stage = override.target == "plugins", override.target == stage
-        if not (is_plugin or is_stage or override.target.removeprefix(f"{stage}.") == "use"):
+        if not (is_plugin or is_stage or (stage and override.target.removeprefix(f"{stage}.") == "use")):
             return False
         is_file = is_plugin and not override.written.strip().startswith("[")
         value = override.as_text() if is_file else override.parsed(problems)

@@ -329,8 +329,8 @@ def is_doubtful(link: BlockLink) -> bool:
 def evidence_of_blocks(blocks: Sequence[Block], alignment: BlockAlignment) -> dict[str, tuple[float, str]]:
     """Return the common cameras that two blocks place differently, with a likelihood ratio and what it rests on.
 
-    At most one of two different poses is right: if that of one block is, the other one is wrong, which is as probable
-    as that block found.
+    At most one of two different poses is right: if that of one block is, the other one is wrong. Which of the two is
+    used is not known here, so that the more probable one speaks against it.
     """
     found: dict[str, tuple[float, str]] = {}
     for link in alignment.links:
@@ -338,7 +338,7 @@ def evidence_of_blocks(blocks: Sequence[Block], alignment: BlockAlignment) -> di
         for name, offset in zip(link.names, link.offsets.tolist(), strict=True):
             if offset > 0.5 * link.spacing:  # the distance between neighbouring cameras
                 found[name] = (
-                    1 - min(probabilities[name] for probabilities in known),
+                    1 - max(probabilities[name] for probabilities in known),
                     f"{blocks[link.first].name} and {blocks[link.second].name} place it "
                     f"{offset / link.spacing:.2g} times the distance between neighbouring cameras apart",
                 )

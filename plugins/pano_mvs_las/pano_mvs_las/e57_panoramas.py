@@ -26,6 +26,8 @@ _OTHERS = {
 }
 _SUFFIXES = {"jpegImage": ".jpg", "pngImage": ".png"}
 _SUFFIX = re.compile(r"\.(jpe?g|png)$", re.IGNORECASE)
+_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # names of devices in Windows
+_LONGEST_NAME = 80
 _NOT_IN_A_NAME = re.compile(r"[^\w.() +-]+")
 
 
@@ -124,14 +126,18 @@ def _pose(image: Any, where: str) -> Rigid3 | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
+    file = None
     try:
         file = libe57.ImageFile(str(path), "r")
-    except Exception as error:  # libE57 raises exceptions of many kinds
-        raise InputError(f"{path}: cannot be read as E57 ({error}). Export it again") from error
-    try:
         yield file
+    except InputError:
+        raise
+    except Exception as error:  # libE57 raises exceptions of many kinds, with many lines
+        why = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{path}: cannot be read as E57 ({why}). Copy it, or export it, again") from error
     finally:
-        file.close()
+        if file is not None:
+            file.close()
 
 
 def _images(file: Any) -> list[Any]:
@@ -141,20 +147,20 @@ def _images(file: Any) -> list[Any]:
 
 
 def _named_images(file: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the spherical images with names that are unique: images need none, and several may have the same."""
+    """Yield the spherical images with unique names: images need none, and several may have the same."""
     used = set[str]()
     for idx, image in enumerate(_images(file)):
         if not _is_sphere(image):
             continue
         stated = image["name"].value() if image.isDefined("name") else ""
-        stem = _NOT_IN_A_NAME.sub("_", stated).strip(". ") or f"image_{idx:04d}"
+        stem = _NOT_IN_A_NAME.sub("_", stated).strip(". ")[:_LONGEST_NAME] or f"image_{idx:04d}"
         suffix = next((suffix for key, suffix in _SUFFIXES.items() if image[_SPHERE].isDefined(key)), ".jpg")
         stem = _SUFFIX.sub("", stem) or stem
-        name = f"{stem}{suffix}"
-        while name in used:
+        stem = f"image_{stem}" if _RESERVED.fullmatch(stem) else stem
+        while stem.casefold() in used:
             stem = f"{stem}_{idx:04d}"
-            name = f"{stem}{suffix}"
-        used.add(name)
+        used.add(stem.casefold())
+        name = f"{stem}{suffix}"
         yield name, image
 
 

@@ -123,7 +123,7 @@ def poses_e57(images: All[Panorama], params: PosesParams, ctx: Context) -> Poses
         ctx.reject(name, reason)
     ctx.metric("registered", len(placed) / len(images))
     centers = np.array([pose.center for pose in placed.values()])
-    if np.ptp(centers, axis=0).max() == 0.0:
+    if np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())):
         raise InputError(
             f"{params.path}: all {len(placed)} panoramas are in the same place, as if the poses were not exported; "
             "depth needs different places. Export them again, or let a preset find the poses"

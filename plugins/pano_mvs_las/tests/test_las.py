@@ -30,7 +30,7 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from pano_mvs_las import e57, las, poses_e57, source_e57
-from pano_mvs_las.e57_panoramas import list_panoramas
+from pano_mvs_las.e57_panoramas import list_panoramas, read_picture
 from pano_mvs_las.sources import PosesParams, SourceParams, list_items
 from pano_mvs_las.stages import CloudParams, E57Params, LasParams
 
@@ -386,11 +386,16 @@ def test_what_an_e57_file_does_not_say_is_unknown(tmp_path: Path) -> None:
             {"name": "a/b: 1", "sphericalRepresentation": sphere(PICTURE), "pose": pose_at(1.0)},
             {"name": "c.png", "sphericalRepresentation": sphere(PICTURE)},
             {"name": "c.png", "sphericalRepresentation": sphere(PICTURE), "pose": pose_at(2.0)},
+            {"name": "C.jpg", "sphericalRepresentation": sphere(PICTURE)},
+            {"name": "con", "sphericalRepresentation": sphere(PICTURE)},
+            {"name": "x" * 240, "sphericalRepresentation": sphere(PICTURE)},
             {"name": "cam 0", "pinholeRepresentation": {"imageWidth": 4}},
         ],
     )
     items = list(list_items(SourceParams(path=path)))
-    assert [item.name for item in items] == ["image_0000.png", "a_b_ 1.png", "c.png", "c_0003.png"]
+    named = ["image_0000.png", "a_b_ 1.png", "c.png", "c_0003.png", "C_0004.png", "image_con.png", f"{'x' * 80}.png"]
+    assert [item.name for item in items] == named
+    assert not any(item.problem for item in items)
     note = "scan.e57: 1 image of a pinhole camera is not used: only spherical images are panoramas"
     assert all(item.notes == (note,) for item in items)
     images = read_back(path, tmp_path / "in")
@@ -398,7 +403,7 @@ def test_what_an_e57_file_does_not_say_is_unknown(tmp_path: Path) -> None:
     assert images["c.png"].crop_ltwh is None
     poses = poses_e57(images, PosesParams(path=path), Context(np.random.default_rng(0), tmp_path))
     assert poses.names == ("image_0000.png", "a_b_ 1.png", "c_0003.png")
-    assert poses.rejected == {"c.png": "scan.e57 has no pose of it"}
+    assert poses.rejected == dict.fromkeys(["c.png", *named[4:]], "scan.e57 has no pose of it")
     np.testing.assert_allclose(poses.centers, [[0, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-12)
     # The middle of the picture, our z axis, is the x axis of the image, and up is up.
     np.testing.assert_allclose(poses.rotations[0].T @ [0, 0, 1], [1, 0, 0], atol=1e-12)
@@ -431,6 +436,18 @@ def test_an_image_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str
         list_panoramas(file_of(tmp_path / "scan.e57", images))
 
 
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    images = [{"sphericalRepresentation": sphere(PICTURE), "pose": pose_at(float(idx))} for idx in range(2)]
+    path = file_of(tmp_path / "scan.e57", images)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 4] ^= 255
+    path.write_bytes(bytes(data))
+    first = list_panoramas(path)[0][0]
+    with pytest.raises(InputError, match=r"scan.e57: cannot be read as E57 \(.*\). Copy it") as found:
+        read_picture(path, first.name)
+    assert "\n" not in str(found.value)
+
+
 def test_files_without_panoramas_or_poses_say_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "text.e57").write_text("no")
     with pytest.raises(InputError, match=r"text.e57: cannot be read as E57"):
@@ -442,8 +459,9 @@ def test_files_without_panoramas_or_poses_say_what_to_do(tmp_path: Path) -> None
     ctx = Context(np.random.default_rng(0), tmp_path)
     with pytest.raises(InputError, match="has poses of 0 images of this capture"):
         poses_e57(read_back(bare, tmp_path / "in"), PosesParams(path=bare), ctx)
-    same = {"sphericalRepresentation": sphere(PICTURE), "pose": pose_at(1.0)}
-    still = file_of(tmp_path / "still.e57", [same, same])
+    half = {"rotation": {"w": 0.6, "x": 0.0, "y": 0.0, "z": 0.8}, "translation": {"x": 1.2, "y": 3.4, "z": 5.6}}
+    same = [{"sphericalRepresentation": sphere(PICTURE), "pose": pose} for pose in (pose_at(1.2, 3.4, 5.6), half)]
+    still = file_of(tmp_path / "still.e57", same)
     with pytest.raises(InputError, match="all 2 panoramas are in the same place"):
         poses_e57(read_back(still, tmp_path / "again"), PosesParams(path=still), ctx)
     turned = {

@@ -12,7 +12,7 @@ import pytest
 from pano_mvs.algorithms.learned.aliked import joined
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM
 from pano_mvs.algorithms.learned.similar_pairs import learned_pairs
-from pano_mvs.algorithms.learned.weak_images import weak_images
+from pano_mvs.algorithms.learned.weak_images import _without_bridges, weak_images
 from pano_mvs.algorithms.poses.frame.gauge import no_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
@@ -171,3 +171,12 @@ def test_an_image_without_key_points_is_weak() -> None:
     """Its vector was longer than those of the others, which stopped the stage."""
     capture = {**CAPTURE, "g": CAPTURE["a"].only_learned()}
     assert weak_images(capture, RING, placed()).weak == ("g",)
+
+
+def test_a_bridge_between_two_firm_parts_makes_the_smaller_one_weak() -> None:
+    assert weak(pairs("ab", "bc", "cd", "ad", "de", "ef")) == "ef"
+    chain = list(pairwise(range(600)))
+    assert _without_bridges(chain, 600) == []
+    assert _without_bridges([*chain, (0, 599)], 600) == sorted([*chain, (0, 599)])
+    two_rings = [(0, 1), (1, 2), (0, 2), (2, 3), (3, 4), (4, 5), (3, 5)]
+    assert _without_bridges(two_rings, 7) == [edge for edge in sorted(two_rings) if edge != (2, 3)]

@@ -28,6 +28,17 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
+NO_FEATURES = Features(
+    bearings=np.zeros((0, 3)),
+    descriptors=np.zeros((0, 1), np.float32),
+    sizes_rad=np.zeros(0, np.float32),
+    scores=np.zeros(0, np.float32),
+    colors_rgb=np.zeros((0, 3), np.uint8),
+    metric="l2",
+    size_hw=(1, 2),
+)
+"""Those of an image of which only the name is known."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
@@ -69,16 +80,7 @@ class Pairs:
     @staticmethod
     def without(names: Sequence[str]) -> Pairs:
         """Return pairs without key points and matches, for images of which only the names are known."""
-        nothing = Features(
-            bearings=np.zeros((0, 3)),
-            descriptors=np.zeros((0, 1), np.float32),
-            sizes_rad=np.zeros(0, np.float32),
-            scores=np.zeros(0, np.float32),
-            colors_rgb=np.zeros((0, 3), np.uint8),
-            metric="l2",
-            size_hw=(1, 2),
-        )
-        return Pairs(dict.fromkeys(names, nothing), {})
+        return Pairs(dict.fromkeys(names, NO_FEATURES), {})
 
 
 def pairs_of(

@@ -24,7 +24,8 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 WIDTH_PX = 256
 _SETTINGS = SURFACE_SETTINGS.replace(planes=64, spacing="inverse")
-_SOURCES = 4
+SOURCES = 4
+"""Maximum number of cameras against which one is swept."""
 SHARED_FROM = 8
 """With this number of cameras or more, a model is judged by sweeps that its cameras share."""
 # With less textured area than this share of the sphere, nothing can be concluded about a pose.
@@ -273,7 +274,7 @@ def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequen
     return classes
 
 
-def nearest_cameras(pose: Rigid3, cameras: Mapping[int, Rigid3], *, count: int = _SOURCES) -> list[int]:
+def nearest_cameras(pose: Rigid3, cameras: Mapping[int, Rigid3], *, count: int = SOURCES) -> list[int]:
     """Return the cameras nearest to a pose, nearest first; cameras at the same position are left out."""
     distances = {idx: float(np.linalg.norm(camera.center - pose.center)) for idx, camera in cameras.items()}
     farthest = max(distances.values(), default=0.0)

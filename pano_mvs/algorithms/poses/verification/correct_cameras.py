@@ -14,7 +14,7 @@ from pano_mvs.algorithms.poses.verification.arrangements import is_more_confirme
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence, is_same_place
-from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, SOURCES, Confirmation, nearest_cameras
 from pano_mvs.geometry import Rigid3
 
 _MAX_PLACES = 4  # number of places of an image that are compared, as many as a camera has neighbours in a small sweep
@@ -201,7 +201,8 @@ def _without_worst(
     """Return the model without the camera that is wrong most surely, and without those that only it holds.
 
     It is None if no camera is wrong surely enough, if others would be confirmed less without it, or if fewer than three
-    are left. The others may have been doubted because of it, so they are to be judged again.
+    are left. Whether others are confirmed less is only asked where each of them keeps its number of sources: fewer ones
+    confirm less, wherever they are. The others may have been doubted because of it, so they are to be judged again.
     """
     worst = min(found.p_right.keys() - fixed, key=lambda image: (found.p_right[image], image), default=None)
     if worst is None or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
@@ -210,9 +211,10 @@ def _without_worst(
     cameras = {image: camera for image, camera in model.cameras.items() if image not in gone}
     if len(cameras) <= 2:
         return None
-    shares, before = confirmation.shares(cameras), confirmation.shares(model.cameras)
-    if is_more_confirmed({image: share for image, share in before.items() if image not in gone}, shares):
-        return None
+    if len(cameras) > SOURCES:
+        shares, before = confirmation.shares(cameras), confirmation.shares(model.cameras)
+        if is_more_confirmed({image: share for image, share in before.items() if image not in gone}, shares):
+            return None
     held = dict.fromkeys(sorted(gone - {worst}), "its pairs are all with images that were left out")
     found.removed |= {worst: found.doubts[worst]} | held
     return model.with_cameras(cameras)

@@ -12,12 +12,11 @@ import numpy as np
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
-from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.placement.placed_model import NO_FEATURES, Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.arrangements import (
-    is_more_confirmed,
+    is_better_arrangement,
     other_arrangements,
     settled,
-    shares_of,
 )
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
@@ -64,8 +63,9 @@ def verify_poses(
     """
     if len(poses.names) < 2:
         return poses
-    known = features is not None and all(name in features for name in poses.names)
-    capture = _Capture(load, features if known and features else {}, two_views or {}, names=poses.names)
+    known = {**features, **{name: NO_FEATURES for name in poses.names if name not in features}} if features else {}
+    usable = {pair: view for pair, view in (two_views or {}).items() if features and features.keys() >= {*pair}}
+    capture = _Capture(load, known, usable, names=poses.names)
     if correct and capture.pairs.compared and not poses.metric:
         checked = _verified(poses, capture, correct=False, miss_cost=miss_cost)
         if not _images_decide(checked, capture):
@@ -84,7 +84,7 @@ class _Capture:
         *,
         names: Sequence[str],
     ) -> None:
-        self.features, self.two_views = features, two_views if features else {}
+        self.features, self.two_views = features, two_views
         self.names = tuple(features) or tuple(names)
         self.position = {name: idx for idx, name in enumerate(self.names)}
         self.confirmation = Confirmation(lambda image: load(self.names[image]))
@@ -134,19 +134,16 @@ def _images_decide(poses: Poses, capture: _Capture) -> bool:
 def _more_confirmed(poses: Poses, capture: _Capture) -> Poses | None:
     """Return the arrangement of a capture that the images confirm most of those with few pairs; None for its own."""
     best = None
-    shares = shares_of(
-        [{capture.position[name]: pose for name, pose in group.cameras.items()} for group in split_groups(poses)],
-        capture.confirmation,
-    )
+    cameras = [{capture.position[name]: pose for name, pose in group.cameras.items()} for group in split_groups(poses)]
     for models in other_arrangements(capture.features, capture.two_views, capture.pairs):
-        found = shares_of([model.cameras for model in models], capture.confirmation)
-        if is_more_confirmed(found, shares):
-            best, shares = models, found
+        found = [model.cameras for model in models]
+        if is_better_arrangement(found, cameras, capture.confirmation):
+            best, cameras = models, found
     if best is None:
         return None
     if len(best) > 1:
         joined = [settled(model, capture.pairs) if len(parts) > 1 else model for model, parts in join_models(best)]
-        if is_more_confirmed(shares_of([model.cameras for model in joined], capture.confirmation), shares):
+        if is_better_arrangement([model.cameras for model in joined], cameras, capture.confirmation):
             best = joined
     groups = [normalised_poses(poses_of(model)) for model in best]
     missing = dict.fromkeys(capture.names, "the arrangement that the images confirm most has no place for it")

@@ -9,6 +9,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.arrangements import (
     SHARE_STD,
+    is_better_arrangement,
     is_more_confirmed,
     other_arrangements,
     shares_of,
@@ -16,6 +17,7 @@ from pano_mvs.algorithms.poses.verification.arrangements import (
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import correct_cameras
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.room_pictures import WHOLE, Vector, moved, room_capture, room_matches
 from tools.benchmarks.belief.families import draw
 from tools.benchmarks.belief.measuring import matched
@@ -49,6 +51,19 @@ def test_a_camera_that_is_missing_or_cannot_be_judged_confirms_nothing() -> None
     assert is_more_confirmed(both, {0: 0.6})
     assert is_more_confirmed(both, {0: 0.6, 1: np.nan})
     assert not is_more_confirmed({0: np.nan}, {})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_in_a_wrong_place_makes_an_arrangement_no_better(seed: int) -> None:
+    """Another source makes the maps of the others better, wherever it is: three right cameras lost against four."""
+    rng = np.random.default_rng(seed)
+    three = {image: POSES[image] for image in range(3)}
+    turn = rotation_from_rotvec([0.0, rng.uniform(1.0, 5.0), 0.0])
+    wrong = Rigid3.from_center(turn @ POSES[3].rotation, POSES[3].center + rng.normal(size=3))
+    found = confirmation()
+    assert not is_better_arrangement([{**three, 3: wrong}], [three], found)
+    assert is_better_arrangement([{**three, 3: POSES[3]}], [three], found)
+    assert is_better_arrangement([{**three, 3: POSES[3]}], [{**three, 3: wrong}], found)
 
 
 @pytest.mark.slow

@@ -137,12 +137,15 @@ def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: M
 
 
 @pytest.mark.slow
-def test_key_points_of_some_images_alone_are_not_enough_to_move_any(matches: Matches) -> None:
+def test_an_image_without_key_points_takes_nothing_from_the_others(matches: Matches) -> None:
+    """Such as one whose unit failed: all cameras were doubted because of it."""
     features, two_views = matches
-    given = displaced("2.png")
-    found = verified(given, ({name: features[name] for name in NAMES[:4]}, two_views))
-    assert set(found.doubts) == {"2.png"}
-    assert found.translations.tobytes() == given.translations.tobytes()
+    known = {name: features[name] for name in NAMES[:4]}
+    found = verified(displaced("2.png"), (known, two_views))
+    assert np.linalg.norm(found.cameras["2.png"].center - TRUTH["2.png"].center) < 0.02 * EXTENT
+    for name in set(NAMES) - {"2.png"}:
+        assert bytes_of(found, name) == bytes_of(displaced("2.png"), name)
+    assert set(verified(poses_of(TRUTH), (known, two_views)).doubts) <= {NAMES[4]}
 
 
 def test_an_image_of_another_place_is_left_out_with_the_reason(matches: Matches) -> None:

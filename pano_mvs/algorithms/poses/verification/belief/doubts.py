@@ -117,10 +117,11 @@ def with_later_evidence(
     for idx, name in enumerate(poses.names):
         if name in evidence:
             ratio, why = evidence[name]
-            probabilities[idx] = before[name] * ratio / (before[name] * ratio + 1 - before[name])
+            odds = ratio * before[name] / max(1 - before[name], 1e-12)
+            probabilities[idx] = odds / (1 + odds)
             if is_doubtful(probabilities[idx], miss_cost=miss_cost):
-                stated = f"its pose is right with a probability of {_percent(probabilities[idx])}: {why}"
-                doubts[name] = "; ".join(filter(None, (poses.doubts.get(name), stated)))
+                earlier = poses.doubts.get(name, "").removeprefix(_stated(before[name]))
+                doubts[name] = _stated(probabilities[idx]) + "; ".join(filter(None, (why, earlier)))
     return replace(poses, right_probabilities=probabilities, doubts=doubts)
 
 
@@ -143,8 +144,11 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
     said = [_SAID[name][0](row) if np.isfinite(row.get(name, np.nan)) else _SAID[name][1] for name in worst]
     advice = ", or ".join(dict.fromkeys(_SAID[name][2] for name in worst))
     why = ", and ".join(dict.fromkeys(filter(None, said))) or "nothing speaks against it, but miss_cost demands more"
-    stated = f"its pose is right with a probability of {_percent(model.probability(row))}: {why}"
-    return "; ".join(filter(None, (stated, ambiguity, advice)))
+    return _stated(model.probability(row)) + "; ".join(filter(None, (why, ambiguity, advice)))
+
+
+def _stated(probability: float) -> str:
+    return f"its pose is right with a probability of {_percent(probability)}: "
 
 
 def _percent(share: float, digits: int = 0) -> str:

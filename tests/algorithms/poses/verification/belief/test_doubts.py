@@ -95,6 +95,21 @@ def test_later_evidence_changes_the_probability_and_the_doubt_follows_from_it() 
     found.check()
 
 
+def test_a_doubt_states_the_latest_probability_with_all_reasons() -> None:
+    poses = poses_with(0.6, 0.9, 0.9)
+    poses = replace(poses, doubts={"0.png": "its pose is right with a probability of 60 %: it repeats"})
+    found = with_later_evidence(poses, {"0.png": (0.01, "other views contradict it")})
+    expected = "its pose is right with a probability of 1 %: other views contradict it; it repeats"
+    assert found.doubts == {"0.png": expected}
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_a_certain_camera_can_be_contradicted(probability: float) -> None:
+    found = with_later_evidence(poses_with(probability, 0.9, 0.9), {"0.png": (0.0, "other views contradict it")})
+    assert found.right_probabilities is not None
+    assert found.right_probabilities[0] == 0.0
+
+
 def test_a_camera_of_which_nothing_was_measured_starts_from_the_usual_share_of_right_ones() -> None:
     usual = FITTED.probability({})
     assert set(probability_of(poses_with()).values()) == {usual}
