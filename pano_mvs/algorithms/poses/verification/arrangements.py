@@ -48,9 +48,8 @@ def is_better_arrangement(
 def _shares_beyond_chance(groups: Iterable[Mapping[int, Rigid3]], confirmation: Confirmation) -> dict[int, float]:
     groups = list(groups)
     shares = shares_of(groups, confirmation)
-    placed = [
-        {image: pose for image, pose in cameras.items() if not shares[image] <= CHANCE_SHARE} for cameras in groups
-    ]
+    by_chance = {image for image, share in shares.items() if share < CHANCE_SHARE}
+    placed = [{image: pose for image, pose in cameras.items() if image not in by_chance} for cameras in groups]
     return shares_of(placed, confirmation) if by_chance else shares
 
 
