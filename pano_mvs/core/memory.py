@@ -23,6 +23,7 @@ _UNITS = {
     "GIB": 2**30,
     "TIB": 2**40,
 }
+MAX_BYTES = 2**63  # more than any address space holds
 _LIBRARIES_BYTES = 10**9  # address space that a process takes which has loaded the libraries: 0.8 GB on Linux
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]*)\s*")
 
@@ -31,12 +32,15 @@ def bytes_from_size(size: str | int) -> int:
     """Return the bytes of a size such as `2GB`, `1.5 GiB` or a number of bytes.
 
     Raises:
-        ValueError: if the text is not a size.
+        ValueError: if the text is not a size, or more than `MAX_BYTES`.
     """
     match = _SIZE.fullmatch(str(size))
     if match is None or match[2].upper() not in _UNITS:
         raise ValueError("must be a size such as 500MB, 2GB or 1.5GiB")
-    return int(float(match[1]) * _UNITS[match[2].upper()])
+    size_bytes = float(match[1]) * _UNITS[match[2].upper()]
+    if size_bytes > MAX_BYTES:
+        raise ValueError(f"must be at most {size_text(MAX_BYTES)}")
+    return int(size_bytes)
 
 
 def size_text(size_bytes: int) -> str:

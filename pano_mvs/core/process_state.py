@@ -31,10 +31,13 @@ class ProcessState:
     def restore(self) -> tuple[str, ...]:
         """Make the state as it was, and return the names of what was different, in words."""
         known = {name: value for name, value in self.values.items() if value is not None}  # None: not loaded then
-        changed = tuple(name for name, value in known.items() if _SETTINGS[name][0]() != value)
-        for name in changed:
-            _SETTINGS[name][1](known[name])
-        return changed
+        changed = []
+        for name, value in known.items():
+            read, write = _SETTINGS[name]
+            if read() != value:
+                write(value)
+                changed.append(name)
+        return tuple(changed)
 
 
 @contextmanager
@@ -76,6 +79,24 @@ def _folder() -> str:
 def _set_folder(folder: str) -> None:
     with suppress(OSError):
         os.chdir(folder)
+
+
+def _file_limit() -> int | None:
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+
+def _set_file_limit(limit: int) -> None:
+    if sys.platform == "win32":
+        return
+    import resource
+
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(ValueError, OSError):  # `most` was lowered, too, which only root can undo
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, most))
 
 
 def _set_environment(variables: dict[str, str]) -> None:
@@ -124,6 +145,9 @@ class _FloatEnvironment:
 
 
 _SETTINGS: dict[str, tuple[Callable[[], Any], Callable[[Any], object]]] = {
+    # The first two come first because restoring the others may take calls and files.
+    "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
+    "the limit of open files": (_file_limit, _set_file_limit),
     "OpenCV's optimisation": (lambda: _cv2() and _cv2().useOptimized(), lambda value: _cv2().setUseOptimized(value)),
     "OpenCV's threads": (lambda: _cv2() and _cv2().getNumThreads(), lambda value: _cv2().setNumThreads(value)),
     "numpy's handling of errors": (np.geterr, lambda value: np.seterr(**value)),

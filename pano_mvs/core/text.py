@@ -16,10 +16,19 @@ def shortened(text: str, most: int = 2000) -> str:
     >>> shortened("a" * 10 + "b" * 90, 20)
     'aaaaaaaaaabbbbb … (80 characters left out) … bbbbb'
     """
+    text = str.__str__(text)  # a subclass may state another length
     if len(text) <= most:
         return text
     end = most // 4
     return f"{text[: most - end]} … ({len(text) - most} characters left out) … {text[-end:]}"
+
+
+def error_text(error: BaseException) -> str:
+    """Return the message of an exception, shortened; a replacement if the exception fails to make its message."""
+    try:
+        return shortened(str(error))
+    except BaseException as second:
+        return f"(its message cannot be shown: {type(second).__name__})"
 
 
 def plural(count: int, one: str, many: str = "") -> str:

@@ -30,6 +30,7 @@ CHANGES: dict[str, tuple[Callable[[], object], str]] = {
     "no variables": (os.environ.clear, "the environment"),
     "locale": (lambda: locale.setlocale(locale.LC_ALL, "C.UTF-8"), "the locale"),
     "warnings": (lambda: warnings.simplefilter("error"), "the filters of warnings"),
+    "recursion": (lambda: sys.setrecursionlimit(sys.getrecursionlimit() + 1), "the recursion limit"),
     "rounding": (lambda: ctypes.CDLL(None).fesetround(_UPWARD), "the floating-point modes"),
 }
 
@@ -46,6 +47,18 @@ def test_changes_are_named_and_undone(what: str, monkeypatch: pytest.MonkeyPatch
     with restored_state() as found:
         pass
     assert found == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
+def test_a_lower_limit_of_open_files_is_undone() -> None:
+    """Units after that of the plugin could open no files."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with restored_state() as found:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (5, before[1]))
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == before
+    assert found == ["the limit of open files"]
 
 
 def test_windows_has_its_floating_point_modes_in_a_library_of_that_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,18 @@ def test_long_texts_keep_their_beginning_and_end() -> None:
     assert "998002 characters left out" in cut
 
 
+def test_a_text_that_states_another_length_is_shortened() -> None:
+    """The message of a plugin's exception may be one."""
+
+    class Short(str):
+        __slots__ = ()
+
+        def __len__(self) -> int:
+            return 1
+
+    assert len(shortened(Short("x" * 1_000_000))) < 2100
+
+
 @pytest.mark.parametrize(
     ("text", "shown"),
     [

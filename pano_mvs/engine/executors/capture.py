@@ -27,9 +27,8 @@ def captured(log: Path) -> Iterator[None]:
     # The original streams are hidden as well, because code that closes one of them would silence this process.
     kept_streams = sys.stdout, sys.stderr, sys.__stdout__, sys.__stderr__
     kept = [os.dup(_STDOUT), os.dup(_STDERR)]
-    stream = io.TextIOWrapper(
-        os.fdopen(os.dup(target), "wb", 0), "utf-8", errors="backslashreplace", write_through=True
-    )
+    file = os.fdopen(os.dup(target), "wb", 0)
+    stream = io.TextIOWrapper(file, "utf-8", errors="backslashreplace", write_through=True)
     try:
         _flush()
         os.dup2(target, _STDOUT)
@@ -42,7 +41,9 @@ def captured(log: Path) -> Iterator[None]:
         _flush()
         os.dup2(kept[0], _STDOUT)
         os.dup2(kept[1], _STDERR)
-        stream.close()
+        with suppress(ValueError):  # it was detached from its file
+            stream.close()
+        file.close()
         for descriptor in (target, *kept):
             os.close(descriptor)
         with suppress(OSError):

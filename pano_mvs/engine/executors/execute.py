@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -33,7 +34,7 @@ from pano_mvs.core.errors import (
 )
 from pano_mvs.core.files import make_folder
 from pano_mvs.core.process_state import restored_state
-from pano_mvs.core.text import shortened
+from pano_mvs.core.text import error_text, shortened
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.capture import captured
@@ -42,13 +43,23 @@ from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import key_fields, registered_files
-from pano_mvs.engine.stages.stage import Cardinality, Names, Port
+from pano_mvs.engine.stages.stage import Cardinality, Names, Port, place_of
 from pano_mvs.scene import Axis
 from pano_mvs.scene.record import changed_text, vanished_text
 from pano_mvs.scene.two_view import pair_from_name
 
+Key = TypeVar("Key")
+Ref = TypeVar("Ref")
+Value = TypeVar("Value")
+
 MAX_METRICS = 1000
 """Most metrics of a unit: the summary and the report list all of them, which takes 7 s for 10,000."""
+
+MAX_NOTES = 10_000
+"""Most notes of a unit."""
+
+MAX_IMAGES = 100_000
+"""Most images that a unit rejects, or doubts: to list them in the summary and the report takes about 5 s."""
 
 MAX_CHARACTERS = 10_000
 """Most characters of a text that a unit reports."""
@@ -87,7 +98,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
             raise
         try:
             metrics = _checked_metrics(context.metrics)
-            notes = tuple(_checked_text("a note", note) for note in _checked_kind("ctx.notes", context.notes, list))
+            notes = _checked_notes(context.notes)
             rejected = _checked_reasons("ctx.rejected", context.rejected)
             doubts = _checked_reasons("doubted()", value.doubted())
         except ContractError as error:
@@ -102,15 +113,22 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 def _checked_metrics(found: object) -> dict[str, float]:
     """Return the metrics of a unit, or raise ContractError if a record cannot hold them."""
     metrics = _checked_kind("ctx.metrics", found, dict)
-    if len(metrics) > MAX_METRICS:
-        raise ContractError(f"ctx.metrics has {len(metrics):,} entries; a unit may report at most {MAX_METRICS:,}")
-    for name, value in metrics.items():
-        _checked_text("the name of a metric", name)
+    checked: dict[str, float] = {}
+    for key, value in _limited("ctx.metrics", metrics.items(), MAX_METRICS):
+        name = _checked_text("the name of a metric", key)
         if not isinstance(value, Real):
             raise ContractError(f"ctx.metrics[{name!r}] is {_kind_of(value)}, not a number")
-        if not math.isfinite(value):
-            raise ContractError(f"ctx.metrics[{name!r}] is {value}: ctx.metric(name, value) leaves such values out")
-    return {name: float(value) for name, value in metrics.items()}
+        number = float(value)
+        if not math.isfinite(number):
+            raise ContractError(f"ctx.metrics[{name!r}] is {number}: ctx.metric(name, value) leaves such values out")
+        checked[name] = number
+    return checked
+
+
+def _checked_notes(found: object) -> tuple[str, ...]:
+    """Return the notes of a unit, or raise ContractError if a record cannot hold them."""
+    notes = _limited("ctx.notes", _checked_kind("ctx.notes", found, list), MAX_NOTES)
+    return tuple(_checked_text("a note", note) for note in notes)
 
 
 def _checked_reasons(name: str, found: object) -> dict[str, str]:
@@ -118,19 +136,28 @@ def _checked_reasons(name: str, found: object) -> dict[str, str]:
     reasons = _checked_kind(name, found, Mapping)
     return {
         _checked_text(f"an image in {name}", image): _checked_text(f"a reason in {name}", reason)
-        for image, reason in reasons.items()
+        for image, reason in _limited(name, reasons.items(), MAX_IMAGES)
     }
+
+
+def _limited(name: str, found: Iterable[Value], most: int) -> list[Value]:
+    """Return what a unit reports, or raise ContractError if it has too many entries."""
+    entries = list(islice(found, most + 1))
+    if len(entries) > most:
+        raise ContractError(f"{name} has more than {most:,} entries, which is the most that a unit may report")
+    return entries
 
 
 def _checked_text(name: str, text: object) -> str:
     if not isinstance(text, str):
         raise ContractError(f"{name} is {_kind_of(text)}, not a text")
-    if len(text) > MAX_CHARACTERS:
+    plain = str.__str__(text)  # a subclass may state another length
+    if len(plain) > MAX_CHARACTERS:
         raise ContractError(
-            f"{name} has {len(text):,} characters, but at most {MAX_CHARACTERS:,} are possible; ctx.note(text) and "
+            f"{name} has {len(plain):,} characters, but at most {MAX_CHARACTERS:,} are possible; ctx.note(text) and "
             "ctx.reject(image, reason) shorten texts"
         )
-    return text
+    return plain
 
 
 def _checked_kind(name: str, found: Any, kind: type[Any]) -> Any:
@@ -187,11 +214,6 @@ def max_kept_items(refs: Iterable[ItemRef]) -> int:
     by_memory = max(1, 128_000_000 // read)
     # A process may open only about a thousand files, and a stage may read several kinds.
     return min(by_memory, max(1, 128 // opened)) if opened else by_memory
-
-
-Key = TypeVar("Key")
-Ref = TypeVar("Ref")
-Value = TypeVar("Value")
 
 
 class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
@@ -271,22 +293,11 @@ def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
     """
     notes = shortened("".join(f" ({note})" for note in getattr(error, "__notes__", [])))
     if isinstance(error, PanoMvsError):
-        return f"{_text(error)}{notes}", ""
-    frames = traceback.extract_tb(error.__traceback__)
-    # For a plugin, name the line in the plugin; otherwise the line that raised the error.
-    own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
-    if own and isinstance(error, ModuleNotFoundError):
+        return f"{error_text(error)}{notes}", ""
+    if unit.entry.spec.code_digest and isinstance(error, ModuleNotFoundError):
         notes += " (a plugin imports the files beside it at its top, not inside functions)"
-    frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
-    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
+    cause = f"{place_of(error, unit.entry.spec)}: {type(error).__name__}: {error_text(error)}{notes}"
     return cause, shortened("".join(traceback.format_exception(error)), 20_000)
-
-
-def _text(error: BaseException) -> str:
-    try:
-        return shortened(str(error))
-    except Exception as second:  # a plugin's exception may fail to make its text
-        return f"(its message cannot be shown: {type(second).__name__})"
 
 
 def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
@@ -312,24 +323,24 @@ def failed_outcome(unit: Unit, store: Store, error: BaseException) -> JobOutcome
     """Return how a unit ended that raised an error, even if the error cannot be described."""
     try:
         return _failed(unit, store, error)
-    except Exception as second:  # a plugin's error may hold anything, and memory may be used up
-        return JobOutcome("failed", cause=f"{type(error).__name__} ({type(second).__name__}: {_text(second)})")
+    except BaseException as second:  # a plugin's error may hold anything, and memory may be used up
+        return JobOutcome("failed", cause=f"{type(error).__name__} ({type(second).__name__}: {error_text(second)})")
 
 
 def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     if isinstance(error, StoreError | RunStoppedError) and not isinstance(error, DamagedBlobError):
         kind = StoreError if isinstance(error, StoreError) else RunStoppedError
-        return JobOutcome("stopped", cause=_text(error), error=kind.__name__, exit_code=error.exit_code)
+        return JobOutcome("stopped", cause=error_text(error), error=kind.__name__, exit_code=error.exit_code)
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
         store.stat_cache.forget(error.path)
-        changed.setdefault(str(error.path), str(error))  # its content may have been restored
+        changed.setdefault(str(error.path), error_text(error))  # its content may have been restored
     if changed and unit.source is None:
         return JobOutcome("changed", cause="\n".join(changed.values()), changed=changed)
     if reasons := [*changed.values(), *changed_settings(unit, store)]:
         return JobOutcome("failed", cause=reasons[0])
     if isinstance(error, DamagedBlobError):
-        return JobOutcome("damaged", cause=str(error))
+        return JobOutcome("damaged", cause=error_text(error))
     gone = next((ref for ref in unit.input_blobs() if not store.blobs.exists(ref)), None)
     if gone is not None:  # garbage collection deleted it before the stage read it
         return JobOutcome("damaged", cause=str(store.blobs.discard(gone, "is missing")))

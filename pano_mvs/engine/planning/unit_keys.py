@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,13 +13,13 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, InputError, PanoMvsError, PluginError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.core.paths import reason_of
-from pano_mvs.core.text import shortened, shortened_list
+from pano_mvs.core.text import error_text, shortened_list
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.planning.units import PENDING, WHOLE, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
-from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, SourceItem
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, SourceItem, place_of
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
@@ -62,11 +61,10 @@ class SourceListing:
                     raise TypeError(f"an item is a {type(other[0]).__name__}, not a SourceItem")
             except PanoMvsError:
                 raise
-            except (Exception, SystemExit) as error:
-                if entry.spec.is_built_in:
+            except BaseException as error:
+                if entry.spec.is_built_in or type(error) is KeyboardInterrupt:
                     raise
-                frame = traceback.extract_tb(error.__traceback__)[-1]
-                what = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {shortened(str(error))}"
+                what = f"{place_of(error, entry.spec)}: {type(error).__name__}: {error_text(error)}"
                 raise PluginError(f"{entry.name}: source {entry.spec.name} cannot list its items: {what}") from error
             self._items[entry.name] = items
         return self._items[entry.name]

@@ -10,8 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import temporary_prefix
-from pano_mvs.core.memory import size_text
+from pano_mvs.core.memory import MAX_BYTES, size_text
 from pano_mvs.core.paths import is_inside, stat_of
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
@@ -207,9 +208,10 @@ class UnitMemory:
     def _loading_of_item(self, ref: ItemRef, kind: type[Record]) -> int:
         if ref.digest not in self._loading_bytes:
             try:
-                self._loading_bytes[ref.digest] = self._store.load(ref, kind).loading_bytes()
+                size_bytes = self._store.load(ref, kind).loading_bytes()
             except DamagedBlobError:
                 return 0  # the unit meets the damage too, and is computed again with its inputs
+            self._loading_bytes[ref.digest] = _checked_bytes(size_bytes, f"loading_bytes of {kind.kind_name()}")
         return self._loading_bytes[ref.digest]
 
 
@@ -220,6 +222,19 @@ def _declared(unit: Unit, store: Store) -> int:
         return stated or spec.memory_bytes
     try:
         inputs = {"item": unit.source} if unit.source is not None else arguments_of(unit, store)
-        return int(spec.memory_needed(unit.entry.params, inputs))  # a plugin may return anything
+        needed = spec.memory_needed(unit.entry.params, inputs)
     except DamagedBlobError:
         return 0  # the unit meets the damage too, and is computed again with its inputs
+    return _checked_bytes(needed, f"the function for the memory of stage {spec.name} ({spec.origin})")
+
+
+def _checked_bytes(returned: float, function: str) -> int:
+    """Return a number of bytes that a function, which may be a plugin's, returned.
+
+    Raises:
+        ContractError: if no unit can need that many.
+    """
+    size_bytes = int(returned)
+    if not 0 <= size_bytes <= MAX_BYTES:
+        raise ContractError(f"{function} must return a number of bytes from 0 to {size_text(MAX_BYTES)}")
+    return size_bytes

@@ -336,7 +336,9 @@ class RunPass:
         dispatcher = self._run.dispatcher
         try:
             fits = dispatcher.fits(unit)
-        except (Exception, SystemExit) as error:  # of a plugin's function for its memory
+        except BaseException as error:  # of a plugin's function for its memory
+            if type(error) is KeyboardInterrupt:
+                raise
             self._duplicates[unit.key] = []
             self._statistics.unit_started(unit.entry, unit.item)
             self._end(FinishedJob(unit, failed_outcome(unit, self._store, error)))

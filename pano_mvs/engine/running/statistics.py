@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from statistics import mean
 from struct import Struct
 
 from pano_mvs.core.errors import InputError, RunStoppedError
@@ -132,7 +134,7 @@ class RunStatistics:
         for metrics in summary.unit_metrics.values():
             for name, value in metrics.items():
                 values[name].append(value)
-        summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
+        summary.metrics = {name: _mean(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
         notes = (
             note for item in state.items for note in (*source_notes.get(item, ()), *summary.unit_notes.get(item, ()))
@@ -200,6 +202,12 @@ class RunStatistics:
                 continue
             enter(summary.stage, summary.rejected, result.rejected)
             enter(summary.stage, {} if summary.stage in replaced else summary.doubts, result.doubts)
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of finite values, which is finite even if their sum is not."""
+    total = sum(values)
+    return total / len(values) if math.isfinite(total) else mean(values)
 
 
 _positions: dict[tuple[str, ...], tuple[dict[str, int], Struct]] = {}

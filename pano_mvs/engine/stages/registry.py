@@ -23,7 +23,7 @@ from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import children, home_folder, is_file, resolved
 from pano_mvs.core.process_state import restored_state
-from pano_mvs.core.text import shortened
+from pano_mvs.core.text import error_text, shortened
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
 from pano_mvs.engine.stages.stage_code import code_digest
 
@@ -200,7 +200,7 @@ class Registry:
 
 
 def _broken(origin: str, error: BaseException) -> Plugin:
-    summary = shortened(" ".join(f"{type(error).__name__}: {error}".split()))
+    summary = shortened(" ".join(f"{type(error).__name__}: {error_text(error)}".split()))
     return Plugin(origin, (), summary, _trace(error))
 
 
@@ -273,7 +273,7 @@ def _where(error: BaseException, path: Path) -> str:
     own = [frame for frame in frames if Path(frame.filename) == path.absolute()]
     place = f"{path}:{own[-1].lineno}: " if own else ""
     deeper = own and own[-1] is not frames[-1] and "importlib" not in frames[-1].filename
-    text = f"{place}{type(error).__name__}: {shortened(str(error))}"
+    text = f"{place}{type(error).__name__}: {error_text(error)}"
     return f"{text}\n{_trace(error).rstrip()}" if deeper else text
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import traceback
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -190,6 +191,7 @@ class StageSpec:
 
 
 INDEX_PORT = "index"
+_ENGINE = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,6 +290,20 @@ def spec_of(value: object) -> StageSpec | None:
     """Return the stage that an object was declared as, or None."""
     spec = getattr(value, _ATTRIBUTE, None)
     return spec if isinstance(spec, StageSpec) else None
+
+
+def place_of(error: BaseException, spec: StageSpec) -> str:
+    """Return the `file:line` to name for an error of a stage's code.
+
+    For a plugin, this is the line in its file, or otherwise the line that raised the error. If that is in the engine,
+    which then could not use what the plugin returned, it is the line that declares the stage.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    if spec.is_built_in:
+        return f"{frames[-1].filename}:{frames[-1].lineno}"
+    own, _, _ = spec.origin.rpartition(":")
+    frame = next((frame for frame in reversed(frames) if frame.filename == own), frames[-1])
+    return spec.origin if Path(frame.filename).is_relative_to(_ENGINE) else f"{frame.filename}:{frame.lineno}"
 
 
 def _spec(

@@ -30,7 +30,10 @@ MISBEHAVIOURS = {
     ),
     "huge name": ("ctx.metrics['x' * 100_000_000] = 1.0", r"the name of a metric has 100,000,000 characters"),
     "dict": ("ctx.metrics['x'] = {i: i for i in range(10 ** 6)}", r"ctx\.metrics\['x'\] is a value of type dict"),
-    "huge dict": ("ctx.metrics.update({str(i): i for i in range(10 ** 6)})", r"ctx\.metrics has 1,000,001 entries"),
+    "huge dict": (
+        "ctx.metrics.update({str(i): i for i in range(10 ** 6)})",
+        r"ctx\.metrics has more than 1,000 entries, which is the most",
+    ),
     "number as a name": ("ctx.metrics[3] = 1.0", r"the name of a metric is a value of type int"),
     "no metrics": ("ctx.metrics = None", "TypeError"),
     "object in notes": ("ctx.notes.append(object())", r"a note is a value of type object, not a text"),
@@ -50,6 +53,32 @@ MISBEHAVIOURS = {
     "cancelled": ("import asyncio\nraise asyncio.CancelledError", "CancelledError"),
     "generator exit": ("raise GeneratorExit", "GeneratorExit"),
     "notes of an error": ("error = ValueError('odd')\nerror.__notes__ = 5\nraise error", r"ValueError \(TypeError: "),
+    "interrupt as its message": (
+        "class Odd(Exception):\n    def __str__(self): raise KeyboardInterrupt\nraise Odd",
+        r"Odd: \(its message cannot be shown: KeyboardInterrupt\)",
+    ),
+    "exit as its note": (
+        "class Odd:\n    def __str__(self): raise SystemExit(0)\n"
+        "error = ValueError('odd')\nerror.__notes__ = [Odd()]\nraise error",
+        r"ValueError \(SystemExit: 0\)",
+    ),
+    "end as its message": (
+        "class End(BaseException):\n    def __str__(self): raise End\nraise End",
+        r"End: \(its message cannot be shown: End\)",
+    ),
+    "many notes": ("ctx.notes = ['odd'] * 10_001", r"ctx\.notes has more than 10,000 entries"),
+    "many images": (
+        "ctx.rejected = {f'{number}.jpg': 'odd' for number in range(200_000)}",
+        r"ctx\.rejected has more than 100,000 entries",
+    ),
+    "text of another length": (
+        "class Short(str):\n    def __len__(self): return 1\nctx.notes.append(Short('x' * 20_000))",
+        r"a note has 20,000 characters",
+    ),
+    "number of another value": (
+        "class Odd(float):\n    def __float__(self): return float('nan')\nctx.metrics['x'] = Odd(1)",
+        r"ctx\.metrics\['x'\] is nan",
+    ),
     "no memory": ("raise MemoryError", "MemoryError"),
     "too much memory": ("bytearray(1 << 62)", "MemoryError"),
     "recursion": ("def again(): return again()\nagain()", "RecursionError"),
@@ -90,14 +119,19 @@ FATAL = {
 HARMLESS = {
     "closed streams": "import sys\nfor each in (sys.stdout, sys.stderr, sys.__stdout__, sys.__stderr__): each.close()",
     "closed descriptors": "os.close(1)\nos.close(2)",
+    "detached stream": "import io, sys\nsys.stdout = io.TextIOWrapper(sys.stdout.detach(), encoding='utf-8')",
+    "low recursion limit": "import sys\nframe, depth = sys._getframe(), 20\n"
+    "while frame := frame.f_back: depth += 1\nsys.setrecursionlimit(depth)",
     "long note": "ctx.note('x' * 100_000_000)",
     "half a character": r"ctx.note('\ud800'); ctx.metric('\ud800', 1.0); ctx.reject('\ud800', '\ud800')",
 }
 
 
+# A stage that detaches a stream leaves a file to be closed by the garbage collector.
+UNCLOSED = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 NEEDS_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="signals, limits and /proc of Linux")
 WAYS = [
-    pytest.param(("serial", MISBEHAVIOURS), id="serial"),
+    pytest.param(("serial", MISBEHAVIOURS), id="serial", marks=UNCLOSED),
     pytest.param(("processes", MISBEHAVIOURS), id="processes"),
     pytest.param(("processes", FATAL), id="processes-fatal", marks=[pytest.mark.slow, NEEDS_LINUX]),
     pytest.param(
@@ -155,18 +189,43 @@ def test_the_others_go_on_and_the_cache_stays_readable(misbehaved: Misbehaved) -
     assert not list((toy.folder / "cache" / "tmp").iterdir())
 
 
+def test_what_a_value_consists_of_is_the_plugins_error(toy: Toy) -> None:
+    """The line named was one of the engine's."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace("    def explode(self):\n", "    def explode(self):\n        return None\n"),
+    )
+    (failure,) = toy.run().failures
+    assert re.search(r"plug\.py:\d+: AttributeError: 'NoneType'", failure.cause)
+
+
+def test_a_function_for_the_memory_of_loading_is_checked(toy: Toy) -> None:
+    """A huge number overflowed where it was shown as text."""
+    function = "    def loading_bytes(self):\n        return 10 ** 400\n"
+    toy.edit("plug.py", lambda text: text.replace("    value: float\n", f"    value: float\n\n{function}", 1))
+    causes = {failure.cause for failure in toy.run().failures}
+    assert causes == {"loading_bytes of Number must return a number of bytes from 0 to 9223372.0 TB"}
+
+
 @pytest.mark.parametrize(
     ("code", "reason"),
     [
         ("raise ValueError('odd')", r"plug\.py:\d+: ValueError: odd"),
         ("raise SystemExit(0)", r"plug\.py:\d+: SystemExit: 0"),
-        ("return float('nan')", "ValueError: cannot convert float NaN to integer"),
+        ("class End(BaseException): pass\n    raise End('now')", r"plug\.py:\d+: End: now"),
+        ("class Stop(KeyboardInterrupt): pass\n    raise Stop('now')", r"plug\.py:\d+: Stop: now"),
+        ("return 10 ** 400", r"memory of stage toy\.mean \(.*plug\.py:\d+\) must return a number of bytes from 0"),
+        ("return -1", r"memory of stage toy\.mean \(.*plug\.py:\d+\) must return a number of bytes from 0"),
+        ("return float('nan')", r"plug\.py:\d+: ValueError: cannot convert float NaN to integer"),
         ("return float('inf')", "OverflowError: cannot convert float infinity to integer"),
         ("return 'much'", "ValueError: invalid literal"),
     ],
 )
 def test_a_function_for_the_memory_that_fails_costs_its_units(toy: Toy, code: str, reason: str) -> None:
-    """It is called in the main process: the command ended with a traceback, or with exit code 0."""
+    """It is called in the main process: the command ended with a traceback, or with exit code 0.
+
+    Any number was accepted, and a huge one overflowed where it was shown as text.
+    """
     marked = '@stage("toy.mean")'
     function = f"def needed(params, inputs):\n    {code}\n\n"
     toy.edit("plug.py", lambda text: text.replace(marked, f'{function}@stage("toy.mean", memory=needed)'))
@@ -184,8 +243,14 @@ def test_a_function_for_the_memory_that_fails_costs_its_units(toy: Toy, code: st
             r"images: source toy\.source cannot list its items: .*plug\.py:\d+: ValueError: odd",
         ),
         ("raise SystemExit(0)", r"plug\.py:\d+: SystemExit: 0"),
-        ("return None", "TypeError: 'NoneType' object is not iterable"),
-        ("return ['1.txt']", "TypeError: an item is a str, not a SourceItem"),
+        ("class End(BaseException): pass\n    raise End('now')", r"plug\.py:\d+: End: now"),
+        (
+            "class Odd(Exception):\n        def __str__(self): raise ValueError\n    raise Odd",
+            r"plug\.py:\d+: Odd: \(its message cannot be shown: ValueError\)",
+        ),
+        ("return None", r"plug\.py:\d+: TypeError: 'NoneType' object is not iterable"),
+        ("return 3", r"plug\.py:\d+: TypeError: 'int' object is not iterable"),
+        ("return ['1.txt']", r"plug\.py:\d+: TypeError: an item is a str, not a SourceItem"),
     ],
 )
 def test_a_source_that_cannot_list_its_items_is_the_plugins_error(toy: Toy, code: str, reason: str) -> None:

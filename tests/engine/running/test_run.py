@@ -27,6 +27,7 @@ from pano_mvs.engine.stages import stage_code
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.scene import Pairs, Record
+from pano_mvs.session.running import Execution, run_session
 from tests.engine.conftest import PATIENCE_S, Toy, finished_records, ran, start
 from tests.engine.running.test_run_pass import Shelf, run_with, shelf
 from tests.engine.workflows.test_wiring import MORE
@@ -280,6 +281,15 @@ def test_store_that_cannot_be_written_still_serves_what_it_has(finished: Toy, mo
 def test_metric_that_is_not_finite_passes_no_gate(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace('ctx.metric("value", x.value)', 'ctx.metric("value", float("nan"))'))
     assert toy.run("scaled.gate={value: 1}").exit_code == RunStoppedError.exit_code
+
+
+def test_the_mean_of_huge_metrics_is_finite(toy: Toy) -> None:
+    """Their sum is not, and run.json cannot hold infinity."""
+    toy.begin("ctx.metric('huge', 1.7e308); ctx.metric('both', 1.7e308 if x.value < 30 else -1.7e308)")
+    output = run_session(toy.session(), Execution(executor="serial"))
+    (scaled,) = (stage for stage in output.summary.stages if stage.name == "scaled")
+    assert scaled.metrics["huge"] == 1.7e308
+    assert scaled.metrics["both"] == pytest.approx(-0.34e308)
 
 
 def test_a_note_says_how_many_units_gave_it(toy: Toy) -> None:
