@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
-from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.gauge import moved_back
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import (
@@ -394,7 +394,7 @@ def adjust_merged(merged: MergedBlocks) -> MergedBlocks:
     refined = refine_poses(merged.poses)
     if refined.names != merged.poses.names:
         return merged
-    refined = moved_poses(refined, similarity_from_points(refined.centers, merged.poses.centers))
+    refined = moved_back(refined, similarity_from_points(refined.centers, merged.poses.centers))
     return replace(merged, poses=refined, before=merged.poses)
 
 

@@ -31,6 +31,7 @@ from pano_mvs.scene.image_header import (
     of_file,
     stated_size,
     stated_size_of_file,
+    transparent_grey,
 )
 from pano_mvs.scene.image_header import MAX_PIXELS as MAX_PIXELS
 from pano_mvs.scene.record import FilePart
@@ -228,6 +229,10 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
     if not data.startswith(PNG_START):  # whose 16 bits OpenCV reduces to 8 as we do, with half of the memory
         flags |= cv2.IMREAD_ANYDEPTH
     image = decode_picture(data, path, flags, max_pixels=max_pixels)
+    if image is None and holds_floats(data):
+        # OpenCV converts TIFFs of floats with an alpha channel to colours by no flag, but reads all four channels.
+        unchanged = decode_picture(data, path, cv2.IMREAD_UNCHANGED, max_pixels=max_pixels)
+        image = unchanged[..., :3] if unchanged is not None and unchanged.shape[2:] == (4,) else None
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
         raise InputError(
             f"{path}: this OpenCV ({cv2.__version__}) cannot read AVIF images, or the file is damaged. Install a "
@@ -326,9 +331,14 @@ def decode_opacity(path: Path, data: bytes, *, max_pixels: int = MAX_PIXELS) -> 
     if not has_alpha(data):
         return None
     picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED, max_pixels=max_pixels)
-    if picture is None or picture.ndim != 3 or picture.shape[2] not in (2, 4):
+    if picture is None:
         return None
-    shown = np.asarray(picture[..., -1] != 0)
+    if picture.ndim == 2 and (level := transparent_grey(data)) is not None:
+        shown = np.asarray(picture != level)
+    elif picture.ndim == 3 and picture.shape[2] in (2, 4):
+        shown = np.asarray(picture[..., -1] != 0)
+    else:
+        return None
     return None if shown.all() else shown
 
 

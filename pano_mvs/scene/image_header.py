@@ -25,6 +25,7 @@ HDR_STARTS, EXR_START = (b"#?RADIANCE", b"#?RGBE"), b"v/1\x01"
 _WIDTH, _HEIGHT = 256, 257
 _COLORS, _SAMPLES, _EXTRA_SAMPLES, _SAMPLE_FORMAT = 262, 277, 338, 339
 _CMYK, _FLOATS, _ALPHAS = 5, 3, (1, 2)  # values of these fields; alpha is premultiplied (1) or not (2)
+_PNG_GREY = 0  # colour type
 _FIRST_BYTES = 1 << 16
 _HEIF_BYTES = 1 << 20
 _DAMAGE = (struct.error, IndexError, OverflowError, KeyError, ValueError)
@@ -219,22 +220,48 @@ def is_map(data: Data) -> bool:
 
 
 def has_alpha(data: Data) -> bool:
-    """Return whether a PNG, WebP or TIFF file states how opaque its pixels are."""
+    """Return whether a PNG, WebP or colour TIFF file states how opaque its pixels are; see `has_unread_alpha`."""
     try:
         match image_kind(data):
             case "png":
-                is_before_pixels = data.find(b"tRNS", 0, data.find(b"IDAT")) > 0  # of a palette, or of one colour
-                return data[25] in (4, 6) or is_before_pixels
+                return data[25] in (4, 6) or _transparency(data) > 0
             case "webp":
                 kind, start, _ = next(riff_chunks(data))
                 return bool(data[start if kind == b"VP8X" else start + 4] & 16) and kind != b"VP8 "
             case "tiff":
                 fields = _tiff_fields(data)
                 missing = _ALPHAS[1] if fields.get(_SAMPLES) == 4 else 0  # OpenCV writes RGBA without the field
-                return fields.get(_EXTRA_SAMPLES, missing) in _ALPHAS and fields.get(_COLORS) != _CMYK
+                stated = fields.get(_EXTRA_SAMPLES, missing) in _ALPHAS
+                return stated and fields.get(_COLORS) != _CMYK and fields.get(_SAMPLES) != 2
     except (StopIteration, *_DAMAGE):
         pass
     return False
+
+
+def has_unread_alpha(data: Data) -> bool:
+    """Return whether an image is a grey TIFF with an alpha channel, which OpenCV drops."""
+    if image_kind(data) != "tiff":
+        return False
+    fields = _tiff_fields(data)
+    return fields.get(_SAMPLES) == 2 and fields.get(_EXTRA_SAMPLES) in _ALPHAS
+
+
+def transparent_grey(data: Data) -> int | None:
+    """Return the level that a grey PNG without alpha channel states to be transparent, as OpenCV decodes it.
+
+    OpenCV scales levels of 1, 2 and 4 bits to 8. None if there is no such level.
+    """
+    if image_kind(data) != "png" or data[25] != _PNG_GREY or (start := _transparency(data)) < 0:
+        return None
+    (level,) = struct.unpack_from(">H", data, start + 4)
+    bits = data[24]
+    most = (1 << bits) - 1
+    return int(level) & most if bits >= 8 else (level & most) * 255 // most
+
+
+def _transparency(data: Data) -> int:
+    """Return where a PNG's chunk `tRNS` is, of a palette or of one colour; −1 if there is none before the pixels."""
+    return data.find(b"tRNS", 0, data.find(b"IDAT"))
 
 
 def _tiff_fields(data: Data) -> dict[int, int]:

@@ -79,7 +79,8 @@ class World(NamedTuple):
         scale: description of the source of the unit of length.
         metric: whether the unit of length is the metre.
         axes: what is known of the directions of the axes.
-        origin_lla: latitude (deg), longitude (deg) and altitude (m) of the origin; None if they are not known.
+        origin_lla: latitude (deg), longitude (deg) and altitude (m) of the origin, with the axes `NORTH` alone; None if
+            they are not known.
     """
 
     frame: str
@@ -249,6 +250,8 @@ class Poses(Record):
         for name in PER_CAMERA:
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
+        placed = all(world.axes is WorldAxes.NORTH for world in self.worlds if world.origin_lla is not None)
+        require(placed, self, "a world with origin_lla must have the axes NORTH")
         require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")
         require(self.evidence.keys() <= set(self.names), self, "there is evidence for an image that is not registered")
         if tracks:

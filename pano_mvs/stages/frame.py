@@ -17,7 +17,7 @@ from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, f
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.api import All, Context, InputError, InputPath, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.poses.files import match_images, positions_in
+from pano_mvs.io.poses.files import matched_positions
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 
@@ -235,9 +235,10 @@ def _ends(images: All[Panorama], baseline: BaselineParams) -> tuple[str, str]:
 def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, *, ctx: Context) -> Poses:
     up = _up(poses, images, params.vertical)
     if params.positions is not None:
-        place = positions_in(params.positions)
-        matched, _ = match_images(tuple(images), tuple(place), params.positions)
-        surveyed = {name: place[there] for name, there in matched.items()}
+        surveyed, notes = matched_positions(tuple(images), params.positions)
+        for note in notes:
+            if note not in ctx.notes:  # of an earlier group
+                ctx.note(note)
         survey = params.positions.name
         fit = fit_survey(poses, surveyed, up, noise_m=params.gps_noise_m, rng=ctx.rng, survey=survey)
     else:

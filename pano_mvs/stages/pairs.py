@@ -39,7 +39,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
-from pano_mvs.io.poses.files import match_images, positions_in
+from pano_mvs.io.poses.files import matched_positions
 
 
 def _memory_of_auto(params: Params, count: int) -> int:
@@ -157,11 +157,9 @@ class PositionParams(Params):
 def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pairs:
     """Match each image with the nearest ones, by GPS or by approximately known poses."""
     if params.path is not None:
-        place = positions_in(params.path)
-        matched, how = match_images(tuple(images), tuple(place), params.path)
-        positions = {name: place[known] for name, known in matched.items()}
-        if how:
-            ctx.note(how)
+        positions, notes = matched_positions(tuple(images), params.path)
+        for note in notes:
+            ctx.note(note)
     else:
         positions = gps_positions(images)
     if not positions:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -33,7 +32,7 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.core.text import plural, shortened_list
-from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.images.names import match_image_names, without_shared
 from pano_mvs.io.poses.files import match_images, read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import CLOSER, join_groups, require_two_cameras, split_groups
 
@@ -305,8 +304,7 @@ def known_groups(path: Path, images: tuple[str, ...], notes: list[str]) -> Poses
             f"capture (it has {', '.join(list(homes)[:3])} …, the capture "
             f"{', '.join(images[:3])} …)"
         )
-    claims = Counter(known.values())
-    clear = {name: there for name, there in known.items() if claims[there] == 1 or there == name}
+    clear = without_shared(known)
     rejected = {
         name: f"{path.name} has one pose, {there!r}, that matches several images" for name, there in known.items()
     }

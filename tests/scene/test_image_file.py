@@ -6,6 +6,7 @@ import io
 import struct
 import sys
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,15 @@ from PIL import Image
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.exr import write_exr
 from pano_mvs.scene.image_file import decode_image, decode_opacity
-from pano_mvs.scene.image_header import has_alpha, holds_floats, is_map, of_file, stated_size
+from pano_mvs.scene.image_header import (
+    PNG_START,
+    has_alpha,
+    has_unread_alpha,
+    holds_floats,
+    is_map,
+    of_file,
+    stated_size,
+)
 from tests.io.images.pictures import app1, by_pillow, exif
 
 SIZE = (32, 64)
@@ -96,6 +105,20 @@ def test_hdr_pictures_are_tone_mapped_whatever_their_brightness(tmp_path: Path, 
         assert has_alpha(path.read_bytes()) is is_map(path.read_bytes()) is False
         assert holds_floats(path.read_bytes())
         assert stated_size(path.read_bytes()) == SIZE
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_tiffs_of_floats_may_have_transparent_pixels(tmp_path: Path, dtype: type[np.floating]) -> None:
+    """OpenCV decodes four channels of floats only unchanged, so they were refused."""
+    linear = np.random.default_rng(3).uniform(0.1, 2.0, (*SIZE, 4)).astype(dtype)
+    linear[:5, :, 3] = 0
+    path, without = tmp_path / "a.tif", tmp_path / "b.tif"
+    path.write_bytes(bytes(cv2.imencode(".tif", linear)[1]))
+    without.write_bytes(bytes(cv2.imencode(".tif", np.ascontiguousarray(linear[..., :3]))[1]))
+    np.testing.assert_array_equal(decode_image(path), decode_image(without))
+    opaque = decode_opacity(path, path.read_bytes())
+    assert opaque is not None
+    assert np.flatnonzero(~opaque.all(axis=1)).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_values_that_no_colour_has_do_not_spoil_an_hdr_picture(tmp_path: Path) -> None:
@@ -178,6 +201,40 @@ def test_a_colour_of_a_palette_may_be_transparent() -> None:
     opaque = decode_opacity(Path("a"), stream.getvalue())
     assert opaque is not None
     assert np.argwhere(~opaque).tolist() == [[0, 3]]
+
+
+def grey_png(bits: int, transparent: int) -> bytes:
+    """The levels 0 to 3 of a grey PNG in its first row, then zeros."""
+    levels = np.zeros(SIZE, np.uint16)
+    levels[0, :4] = np.arange(4) % (1 << bits)
+    if bits == 16:
+        rows = levels.astype(">u2").view(np.uint8)
+    else:
+        ones = (levels[..., None] >> np.arange(bits)[::-1]) & 1
+        rows = np.packbits(ones.reshape(SIZE[0], -1).astype(np.uint8), axis=1)
+    header = struct.pack(">IIBBBBB", *SIZE[::-1], bits, 0, 0, 0, 0)
+    pixels = zlib.compress(np.pad(rows, [(0, 0), (1, 0)]).tobytes())
+    chunks = [(b"IHDR", header), (b"tRNS", struct.pack(">H", transparent)), (b"IDAT", pixels), (b"IEND", b"")]
+    return PNG_START + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+def test_a_level_of_grey_may_be_transparent(bits: int) -> None:
+    """OpenCV drops it, so it was lost."""
+    opaque = decode_opacity(Path("a"), grey_png(bits, 1))
+    assert opaque is not None
+    assert np.argwhere(~opaque).tolist() == ([[0, 1], [0, 3]] if bits == 1 else [[0, 1]])
+    if bits >= 4:
+        assert decode_opacity(Path("a"), grey_png(bits, 5)) is None
+
+
+def test_the_alpha_of_a_grey_tiff_is_known_to_be_lost() -> None:
+    for data in (with_alpha("LA", "TIFF"), with_alpha("LA", "TIFF", compression="tiff_lzw")):
+        assert has_unread_alpha(data)
+        assert decode_opacity(Path("a"), data) is None
+    assert not any(map(has_unread_alpha, (with_alpha("LA"), with_alpha(kind="TIFF"), saved("TIFF", "L"))))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from pano_mvs.api import FilePart, SourceItem
 from pano_mvs.core.digest import digest_from_file
@@ -185,6 +186,10 @@ def test_transparent_pixels_are_masked(capture: Path) -> None:
     assert {name: masked_rows(panorama) for name, panorama in found.items()} == dict(zip(NAMES, (0, 0, 5), strict=True))
     assert "{count} images have transparent pixels, which are ignored like masked ones" in notes
     assert "a/1.jpg.png: all of it is transparent, so its alpha channel was not used as a mask" in notes
+    assert not any("alpha channel that is not read" in note for note in notes)
+    Image.new("LA", (32, 16)).save(capture / "photos" / "4.tif")
+    assert any("alpha channel that is not read" in note for note in read_folder(capture / "photos")[1])
+    (capture / "photos" / "4.tif").unlink()
     write_mask(capture / "masks" / "3.png", masked=slice(4, 7))
     found, _ = read_folder(capture / "photos", masks=capture / "masks", nadir_deg=20)
     assert masked_rows(found["3.png"]) == 7 + 2, "both masks and the cap count"

@@ -119,7 +119,7 @@ def read_colmap_model(folder: Path) -> Poses:
     panoramic = {camera_id for camera_id, camera in cameras.items() if camera.model == "EQUIRECTANGULAR"}
     if cameras and not panoramic:
         images = list(read_images(files[1]).values())
-        if images and all(_VIRTUAL.fullmatch(image.name) for image in images):
+        if any(_VIRTUAL.fullmatch(image.name) for image in images):
             return _read_virtual_cameras(images, files[1])
         camera_id, camera = min(cameras.items())
         raise InputError(
@@ -201,12 +201,17 @@ def _read_sphere_model(folder: Path) -> Poses:
 
 
 def _read_virtual_cameras(images: Sequence[ModelImage], path: Path) -> Poses:
-    """Return the poses of the panoramas whose virtual cameras a model registers, in its own world and unit."""
+    """Return the poses of the panoramas whose virtual cameras a model registers, in its own world and unit.
+
+    Other images are rejected.
+    """
     by_panorama: dict[str, dict[int, Rigid3]] = {}
+    others: list[str] = []
     for image in images:
-        match = _VIRTUAL.fullmatch(image.name)
-        assert match is not None
-        by_panorama.setdefault(match["panorama"], {})[int(match["number"])] = image.cam_from_world()
+        if match := _VIRTUAL.fullmatch(image.name):
+            by_panorama.setdefault(match["panorama"], {})[int(match["number"])] = image.cam_from_world()
+        else:
+            others.append(image.name)
     count = 1 + max(number for cameras in by_panorama.values() for number in cameras)
     layouts = [cams_from_pano for pitches_deg in _PITCHES_DEG if len(cams_from_pano := _ring(pitches_deg)) >= count]
     fitting = (
@@ -222,6 +227,11 @@ def _read_virtual_cameras(images: Sequence[ModelImage], path: Path) -> Poses:
         )
     return Poses.without_points(
         dict(sorted(poses.items(), key=lambda item: natural_key(item[0]))),
+        rejected={
+            name: "it is not an image of a panorama's virtual camera (pano_camera0/…)"
+            for name in sorted(others, key=natural_key)
+            if name not in poses
+        },
         frame="the world of the COLMAP model",
         scale="the unit of the COLMAP model",
         metric=False,

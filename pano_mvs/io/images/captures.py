@@ -18,7 +18,7 @@ from pano_mvs.io.images.placement import placed
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
-from pano_mvs.scene.image_header import holds_floats, is_map, of_file
+from pano_mvs.scene.image_header import has_unread_alpha, holds_floats, is_map, of_file
 
 _JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".insp"})
 _HEIF_SUFFIXES = frozenset({".avif", ".heic", ".heif", ".hif"})
@@ -38,6 +38,10 @@ _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = (
     "an EXIF orientation that rotates or mirrors them, which was ignored: the pixels of a panorama are used as "
     "they are stored"
+)
+_UNREAD_ALPHA = (
+    "an alpha channel that is not read, as grey TIFF files: no pixel of them is masked. Save them as PNG, or as "
+    "TIFF of colours"
 )
 
 
@@ -165,6 +169,8 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     traits = (*placement.traits, *((_TURNED,) if orientation_from_exif(exif) != 1 else ()))
     if holds_floats(data):
         traits = (*traits, "floating-point colours (HDR), which are tone-mapped to 8 bits, each by its own brightness")
+    if has_unread_alpha(data):
+        traits = (*traits, _UNREAD_ALPHA)
     if gpano is None:
         traits = (*traits, "no GPano metadata; taken as full spheres, since the width is twice the height")
     warnings = (*warnings, *placement.warnings)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
@@ -30,6 +31,16 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     for ours, theirs in _with_same_last_part(wanted, available):
         found |= {name: other for name in ours if (other := _closest(name, theirs))}
     return found
+
+
+def without_shared(matched: Mapping[str, str]) -> dict[str, str]:
+    """Return the matches of names whose counterpart no other name has, or which are exactly their counterpart.
+
+    >>> without_shared({"a/1.jpg": "1.jpg", "b/1.jpg": "1.jpg", "2.jpg": "2.png"})
+    {'2.jpg': '2.png'}
+    """
+    claims = Counter(matched.values())
+    return {name: there for name, there in matched.items() if claims[there] == 1 or there == name}
 
 
 def pair_image_names(names: Iterable[str], available: Iterable[str]) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,10 +10,10 @@ import numpy as np
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
-from pano_mvs.core.text import plural, shortened
+from pano_mvs.core.text import plural, shortened, shortened_list
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
-from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.images.names import match_image_names, without_shared
 from pano_mvs.io.poses.json_files import (
     FilePoses,
     posed_views,
@@ -26,12 +25,16 @@ from pano_mvs.io.poses.json_files import (
 )
 from pano_mvs.io.poses.metashape import read_metashape
 from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
-from pano_mvs.io.poses.positions import NO_POSES, holds_positions, read_positions
+from pano_mvs.io.poses.positions import NO_POSES, csv_cells, holds_positions, latitude_heading, read_positions
 from pano_mvs.io.poses.trajectories import SUFFIXES, match_times, read_trajectory
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
+_CSV_HEADINGS = (
+    f"the first line must be {','.join(CSV_HEADER)} for poses, or, where positions alone are needed, name columns "
+    "name, x, y, z or label, easting, northing, height, in metres"
+)
 _JSON = (".json", ".sfm")
 # The keys by which the JSON object of another program is known.
 _BY_KEYS = (
@@ -152,6 +155,26 @@ def positions_in(path: Path) -> dict[str, FloatArray]:
     return dict(zip(poses.names, poses.centers, strict=True))
 
 
+def matched_positions(images: Sequence[str], path: Path) -> tuple[dict[str, FloatArray], list[str]]:
+    """Return the position (3,) of each image of a capture that one has in a file, and notes on how they were matched.
+
+    Images that match one position together have none.
+
+    Raises:
+        InputError: if the file is invalid, or a trajectory cannot be matched.
+    """
+    place = positions_in(path)
+    matched, how = match_images(images, tuple(place), path)
+    clear = without_shared(matched)
+    notes = [how] if how else []
+    if shared := [name for name in matched if name not in clear]:
+        notes.append(
+            f"{path.name} has one position for several images, which was not used for any of them: "
+            f"{shortened_list(shared, 5)}"
+        )
+    return {name: place[there] for name, there in clear.items()}, notes
+
+
 def match_images(images: Sequence[str], names: Sequence[str], path: Path) -> tuple[dict[str, str], str]:
     """Return the name in a file of poses of each image of a capture, and a note on how they were matched, or "".
 
@@ -179,18 +202,23 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
         InputError: if the file is invalid; it names the line.
     """
     lines = FilePart(path).read_text().splitlines()
-    numbered = [(idx, line) for idx, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    try:
-        rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
-    except csv.Error as error:
-        raise InputError(f"{path}: not a CSV file ({error})") from error
     if holds_positions(path):
         raise InputError(f"{path}: {NO_POSES}")
-    if not rows or tuple(rows[0][1]) != CSV_HEADER:
-        raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
-    poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
-    require_distinct([name for name, _ in poses], path)
-    return dict(poses)
+    rows = [
+        (number, csv_cells(line, ",", f"{path}:{number}"))
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.startswith("#")
+    ]
+    if rows and tuple(rows[0][1]) == CSV_HEADER:
+        poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
+        require_distinct([name for name, _ in poses], path)
+        return dict(poses)
+    if heading := latitude_heading(path):
+        raise InputError(
+            f"{path}:{heading.number}: latitudes and longitudes are not read from a table; {_CSV_HEADINGS}. Convert "
+            "them to metres, such as UTM, or write them into the EXIF metadata of the images"
+        )
+    raise InputError(f"{path}:{rows[0][0] if rows else 1}: {_CSV_HEADINGS}")
 
 
 def _file_or_model(path: Path) -> Path:

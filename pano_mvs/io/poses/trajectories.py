@@ -28,6 +28,7 @@ _TIMES = (
     (re.compile(r"(\d+\.\d+)"), 1.0),
     (re.compile(r"(\d{19})"), 1e-9),
 )
+_WHOLE = (re.compile(r"(\d{1,18})"), 1.0)
 
 
 def read_trajectory(path: Path) -> dict[str, Rigid3]:
@@ -60,15 +61,16 @@ def read_trajectory(path: Path) -> dict[str, Rigid3]:
 def match_times(images: Sequence[str], times: Sequence[str], path: Path) -> tuple[dict[str, str], str]:
     """Return the time of a trajectory at which each image was taken, and how they were matched.
 
-    Images have the time as their name, or in it: `walk_00012345ms.png` of `source.video`, seconds with decimals, or
-    nanoseconds. If no image has a time of the trajectory and there are as many images as poses, both are matched in
-    their order.
+    Images have the time as their name, or in it: `walk_00012345ms.png` of `source.video`, seconds with decimals,
+    nanoseconds, or, if all times are whole numbers, a whole number with leading zeros. If no image has a time of the
+    trajectory and there are as many images as poses, both are matched in their order.
 
     Raises:
         InputError: if they cannot be matched.
     """
-    matched = match_image_names(images, times) or _by_seconds(images, times)
-    if matched:
+    if not times:
+        raise InputError(f"{path}: contains no poses. Give a trajectory with a line for each pose")
+    if matched := _by_seconds(images, times) | match_image_names(images, times):
         return matched, "the times in the names of the images"
     if len(images) == len(times):
         return dict(zip(images, times, strict=True)), "their order, since no image has one of its times in its name"
@@ -82,16 +84,18 @@ def match_times(images: Sequence[str], times: Sequence[str], path: Path) -> tupl
 def _by_seconds(images: Sequence[str], times: Sequence[str]) -> dict[str, str]:
     """Return the nearest time of each image that has one in its name, if it is the same to a millisecond."""
     seconds = np.array([float(time) for time in times])
+    whole = bool((seconds == np.rint(seconds)).all())
     found: dict[str, str] = {}
     for name in images:
-        if (second := _second(name)) is not None:
+        if (second := _second(name, whole=whole)) is not None:
             nearest = int(np.argmin(np.abs(seconds - second)))
             if abs(seconds[nearest] - second) <= _SAME_TIME_S:
                 found[name] = times[nearest]
     return found
 
 
-def _second(name: str) -> float | None:
+def _second(name: str, *, whole: bool) -> float | None:
+    """Return the time in the name of an image, which may be a whole number of seconds if all times are whole."""
     stem = PurePosixPath(without_extension(name)).name
-    matches = ((pattern.fullmatch(stem), unit) for pattern, unit in _TIMES)
+    matches = ((pattern.fullmatch(stem), unit) for pattern, unit in (*_TIMES, *((_WHOLE,) if whole else ())))
     return next((float(match[1]) * unit for match, unit in matches if match), None)

@@ -13,6 +13,7 @@ from pycolmap.panorama import PANO_RENDER_OPTIONS, PanoRenderType, get_virtual_r
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation, rotation_from_rotvec
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.stages.poses import known_groups
 from pano_mvs.testing.room import capture_poses
 
 POSES = dict(zip(("a/10.jpg", "a/2.jpg", "b.png"), capture_poses(3, seed=5), strict=True))
@@ -59,6 +60,17 @@ def test_other_arrangements_are_refused(tmp_path: Path) -> None:
     for other in (turned, {3: cameras[3]}):
         with pytest.raises(InputError, match=r"not turned .* Give the model sparse_equirectangular/0"):
             read_poses(write_model(tmp_path, other))
-    photograph = "900 1 0 0 0 0 0 0 1 photograph.jpg\n"
+
+
+def test_photographs_among_virtual_cameras_are_named(tmp_path: Path) -> None:
+    """One photograph made the whole model unusable."""
+    cameras = dict(enumerate(virtual_cameras(PanoRenderType.PERSPECTIVE_OVERLAPPING)))
+    found = read_poses(write_model(tmp_path, cameras, first="900 1 0 0 0 0 0 0 1 photograph.jpg\n"))
+    assert found.names == ("a/2.jpg", "a/10.jpg", "b.png")
+    assert found.rejected == {"photograph.jpg": "it is not an image of a panorama's virtual camera (pano_camera0/…)"}
+    notes: list[str] = []
+    assert len(known_groups(tmp_path, ("a/2.jpg", "b.png"), notes).names) == 2
+    assert "photograph.jpg (it is not an image of" in notes[0]
+    (tmp_path / "images.txt").write_text("900 1 0 0 0 0 0 0 1 photograph.jpg\n\n")
     with pytest.raises(InputError, match="camera 1 is SIMPLE_PINHOLE, expected EQUIRECTANGULAR"):
-        read_poses(write_model(tmp_path, cameras, first=photograph))
+        read_poses(tmp_path)

@@ -156,7 +156,7 @@ def test_metres_and_doubts_of_a_block_are_kept_without_its_cache(folder: Path, t
         update={
             "metric": True,
             "scale": "by GPS",
-            "axes": WorldAxes.LEVEL,
+            "axes": WorldAxes.NORTH,
             "origin_lla": (47.5, 8.25, 410.0),
             "doubts": {"013.png": "hardly seen"},
         }
@@ -168,7 +168,7 @@ def test_metres_and_doubts_of_a_block_are_kept_without_its_cache(folder: Path, t
     assert (merged.metric, merged.scale, merged.axes, merged.origin_lla) == (
         True,
         "by GPS",
-        WorldAxes.LEVEL,
+        WorldAxes.NORTH,
         (47.5, 8.25, 410.0),
     )
     assert set(result.summary.poses.doubts) <= {"013.png"}

@@ -9,7 +9,7 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, similarity_from_points
-from pano_mvs.scene import Poses
+from pano_mvs.scene import Poses, WorldAxes
 from pano_mvs.scene.pose_groups import per_group
 
 
@@ -52,12 +52,12 @@ def in_gauge_of(poses: Poses, centers: FloatArray) -> Poses:
     poses are of one group.
     """
     if poses.metric and len(centers) >= 3:
-        return moved_poses(poses, similarity_from_points(poses.centers, centers))
+        return moved_back(poses, similarity_from_points(poses.centers, centers))
     neighbour = first_neighbour(centers)
     if not neighbour:
         return poses
     scale = _distance(centers, neighbour) / _distance(poses.centers, neighbour)
-    return moved_poses(poses, Similarity3(scale, np.eye(3), centers[0] - scale * poses.centers[0]))
+    return moved_back(poses, Similarity3(scale, np.eye(3), centers[0] - scale * poses.centers[0]))
 
 
 def first_neighbour(centers: FloatArray) -> int:
@@ -70,7 +70,12 @@ def first_neighbour(centers: FloatArray) -> int:
 
 
 def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
-    """Return poses of one group, with their points, in another world frame."""
+    """Return poses of one group, with their points, in another world frame.
+
+    `axes` become unknown if the world is turned, and `origin_lla` if its origin or its axes change.
+    """
+    is_turned = not np.allclose(new_from_old.rotation, np.eye(3), rtol=0, atol=1e-12)
+    stays = not is_turned and not new_from_old.translation.any()
     cameras = [new_from_old.move_camera(poses.cam_from_world(idx)) for idx in range(len(poses.names))]
     return replace(
         poses,
@@ -78,7 +83,14 @@ def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
         translations=np.array([camera.translation for camera in cameras]),
         points_in_world=new_from_old.apply(poses.points_in_world),
         center_stds=None if poses.center_stds is None else new_from_old.scale * poses.center_stds,
+        axes=WorldAxes.UNKNOWN if is_turned else poses.axes,
+        origin_lla=poses.origin_lla if stays else None,
     )
+
+
+def moved_back(poses: Poses, old_from_new: Similarity3) -> Poses:
+    """Return poses of one group that left their world, as by an adjustment, back in it: its axes and origin stay."""
+    return replace(moved_poses(poses, old_from_new), axes=poses.axes, origin_lla=poses.origin_lla)
 
 
 def _distance(centers: FloatArray, neighbour: int) -> float:

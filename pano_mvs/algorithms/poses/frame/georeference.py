@@ -174,7 +174,7 @@ def georeferenced_poses(poses: Poses, fit: GpsFit) -> Poses:
         x, y, z = fit.origin + first_in_local[[0, 2, 1]] * (1, 1, -1)
         at = f"({x:z.3f}, {y:z.3f}, {z:z.3f})"
         frame = f"x as x, y down, z as y in {fit.survey}; origin at the first registered camera {at}"
-        return replace(metric, frame=frame, axes=WorldAxes.LEVEL)
+        return replace(metric, frame=frame, axes=WorldAxes.LEVEL, origin_lla=None)
     latitude, longitude, altitude = lla_from_local(first_in_local, fit.origin)
     frame = (
         f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:z.7f}°, "

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.gauge import in_gauge_of, moved_poses, normalised_poses
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, fit_survey, georeferenced_poses, scaled_by_gps
+from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses, WorldAxes
@@ -133,6 +134,10 @@ def test_a_survey_gives_its_own_axes() -> None:
     assert (world.axes, world.origin_lla, world.metric) == (WorldAxes.LEVEL, None, True)
     assert world.frame.startswith("x as x, y down, z as y in points.csv; origin at the first registered camera (26000")
     assert world.scale.startswith("metres, by the positions in points.csv of 6 of 6 panoramas")
+    placed = replace(solved, axes=WorldAxes.NORTH, origin_lla=tuple(HOME))
+    again = georeferenced_poses(placed, fit)
+    assert (again.axes, again.origin_lla) == (WorldAxes.LEVEL, None), "of the GPS, which the survey replaces"
+    again.check()
     few = dict(list(surveyed.items())[:2])
     reason = fit_survey(solved, few, turn @ UP, noise_m=0.02, rng=rng, survey="points.csv").reason
     assert reason == "2 of 6 registered panoramas have a position in points.csv; 3 are needed"
@@ -198,3 +203,24 @@ def test_the_world_tells_where_its_origin_is(home: NDArray[Any]) -> None:
     world = georeferenced_poses(poses, fit_gps(poses, lla, UP, gps_noise_m=0.01, rng=rng))
     assert world.origin_lla is not None
     assert np.abs(local_from_lla(world.origin_lla, lla[poses.names[0]])).max() < 0.01
+
+
+def test_a_world_that_is_turned_or_moved_does_not_keep_what_was_known_of_it() -> None:
+    rng = np.random.default_rng(12)
+    placed = replace(street(rng, 4), axes=WorldAxes.NORTH, origin_lla=(47.5, 8.25, 410.0))
+    placed.check()
+    turn, nothing = random_rotation(rng), np.zeros(3)
+
+    def known(poses: Poses) -> tuple[WorldAxes, bool]:
+        poses.check()
+        return poses.axes, poses.origin_lla is not None
+
+    assert known(moved_poses(placed, Similarity3(2.0, np.eye(3), nothing))) == (WorldAxes.NORTH, True)
+    assert known(moved_poses(placed, Similarity3(2.0, np.eye(3), np.ones(3)))) == (WorldAxes.NORTH, False)
+    turned = moved_poses(placed, Similarity3(2.0, turn, nothing))
+    assert known(turned) == (WorldAxes.UNKNOWN, False)
+    assert known(normalised_poses(placed)) == (WorldAxes.UNKNOWN, False)
+    for metric in (True, False):  # an adjustment leaves the world, and comes back
+        assert known(in_gauge_of(replace(placed, metric=metric), 2 * placed.centers)) == (WorldAxes.NORTH, True)
+    with pytest.raises(ContractError, match="a world with origin_lla must have the axes NORTH"):
+        replace(placed, axes=WorldAxes.LEVEL).check()
