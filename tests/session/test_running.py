@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import get_args
 
+import cv2
 import numpy as np
 import pytest
 
@@ -311,3 +312,50 @@ def test_pairs_of_a_later_stage_replace_rejected_ones_and_are_added() -> None:
         PairLink("c", "d", 9, 15, 0.1),
     )
     assert pair_links(matched, {})[1] == PairLink("b", "c", 0, 30, None)
+
+
+SOLVERS = '''
+import cv2
+import numpy as np
+from pano_mvs.api import All, Context, One, Panorama, Poses, Rigid3, stage
+
+
+def placed(names, rejected):
+    cameras = {name: Rigid3.from_center(np.eye(3), np.array([float(idx), 0, 0])) for idx, name in enumerate(names)}
+    return Poses.without_points(cameras, rejected=rejected, frame="f", scale="s", metric=False)
+
+
+@stage("poses.first")
+def first(images: All[Panorama], ctx: Context) -> Poses:
+    """Place two images."""
+    rejected = dict.fromkeys(list(images)[2:], "no place")
+    for name, reason in rejected.items():
+        ctx.reject(name, reason)
+    return placed(list(images)[:2], rejected)
+
+
+@stage("poses.second")
+def second(poses: One[Poses], images: All[Panorama], ctx: Context) -> Poses:
+    """Place all images but the last, and repeat why that is left out."""
+    left = {name: poses.rejected[name] for name in list(images)[3:]}
+    for name, reason in left.items():
+        ctx.reject(name, reason)
+    return placed(list(images)[:3], left)
+'''
+
+
+def test_an_image_that_a_later_stage_places_is_not_left_out(tmp_path: Path) -> None:
+    """A solution from few pairs placed images that the first solver had refused, and the run counted them twice."""
+    (tmp_path / "solvers.py").write_text(SOLVERS)
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(0)
+    for name in "abcd":
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), rng.integers(0, 256, (32, 64, 3)).astype(np.uint8))
+    stages = "{images: {use: source.folder, path: images}, poses: {use: poses.first}, again: {use: poses.second}}"
+    workflow = tmp_path / "two.yaml"
+    workflow.write_text(f"pano_mvs: 1\nname: two\nplugins: [solvers.py]\nstages: {stages}\n")
+    run = pano_mvs.run(workflow, out=tmp_path / "out", cache=tmp_path / "cache", executor="serial")
+    assert run.summary.poses is not None
+    assert list(run.summary.poses.registered) == ["a.png", "b.png", "c.png"]
+    assert list(run.summary.poses.rejected) == list(run.summary.rejected) == ["d.png"]
+    assert run.summary.exit_code == 3
