@@ -6,11 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
+
 from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import PluginError
+from pano_mvs.core.text import error_text
 from pano_mvs.engine.cache.unit_times import CaptureSize, ExpectedUnit, UnitTimes
 from pano_mvs.engine.planning.plan import StagePlan
 from pano_mvs.engine.stages.params import key_fields
-from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage import INDEX_PORT, StageSpec, place_of
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
@@ -81,7 +85,7 @@ class Experience:
         if axis is not Axis.PAIR:
             return images
         if index is not None and index.spec.expected_units is not None:
-            return index.spec.expected_units(index.params, images)
+            return int(_expected(index.spec, index.spec.expected_units, index.params, images))
         settings = settings_digest(entry)
         return self.first(lambda times: times.expected_pairs(plan.use, images, settings=settings))
 
@@ -119,8 +123,27 @@ def expected_memory(workflow: Workflow, graph: Graph, experience: Experience) ->
         if entry.spec.expected_memory is not None and not entry.policy.memory_bytes:
             unit = experience.unit(entry, Axis.ONE)
             stored_bytes = 0.0 if unit is None else unit.stored_bytes
-            found[name] = entry.spec.expected_memory(entry.params, experience.size.images, stored_bytes)
+            images = experience.size.images
+            found[name] = _expected(entry.spec, entry.spec.expected_memory, entry.params, images, stored_bytes)
     return found
+
+
+def _expected(spec: StageSpec, function: Callable[..., float], *arguments: object) -> float:
+    """Return a number that a stage expects.
+
+    Raises:
+        PluginError: if the function of a plugin fails or returns something else; it names the line.
+    """
+    try:
+        number = float(function(*arguments))
+        if not 0 <= number < np.inf:
+            raise ValueError(f"{number} was returned, not a finite number of 0 or more")
+    except BaseException as error:
+        if spec.is_built_in or type(error) is KeyboardInterrupt:
+            raise
+        what = f"{place_of(error, spec)}: {type(error).__name__}: {error_text(error)}"
+        raise PluginError(f"stage {spec.name} cannot say what it expects: {what}") from error
+    return number
 
 
 def makespan(

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pano_mvs.core.digest import digest_from_bytes
+from pano_mvs.core.errors import PluginError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import FILE_NAME, CaptureSize, ExpectedUnit, Sample, UnitTimes
 from pano_mvs.engine.planning.forecast import (
@@ -98,6 +99,20 @@ def test_the_memory_of_stages_for_the_whole_capture_grows_with_it(toy: Toy) -> N
     assert memory(10, session.workflow) == {}
     stated = replace(stages["all"], policy=entry.policy.model_copy(update={"memory": "2GB"}))
     assert memory(10, replace(workflow, stages={**stages, "all": stated})) == {}, "the workflow knows better"
+
+
+@pytest.mark.parametrize("wrong", ["many", None, -1, float("nan"), SystemExit(3)], ids=repr)
+def test_an_expectation_that_a_plugin_cannot_give_is_its_error(toy: Toy, wrong: object) -> None:
+    def expected(_params: object, _images: int, _stored_bytes: float) -> float:
+        if isinstance(wrong, BaseException):
+            raise wrong
+        return wrong  # type: ignore[return-value]  # on purpose
+
+    session = toy.session()
+    entry = session.workflow.stages["all"]
+    stages = {**session.workflow.stages, "all": replace(entry, spec=replace(entry.spec, expected_memory=expected))}
+    with pytest.raises(PluginError, match=rf"stage {entry.spec.name} cannot say what it expects: .*py:\d+: "):
+        expected_memory(replace(session.workflow, stages=stages), session.graph, Experience(CaptureSize(3, 2.0), ()))
 
 
 def test_the_slowest_of_four_units_is_left_out_of_what_is_remembered(toy: Toy) -> None:
