@@ -81,22 +81,30 @@ def _set_folder(folder: str) -> None:
         os.chdir(folder)
 
 
-def _file_limit() -> int | None:
+_LIMITED = ("RLIMIT_NOFILE", "RLIMIT_AS", "RLIMIT_DATA", "RLIMIT_FSIZE")
+
+
+def _limits() -> dict[str, tuple[int, int]]:
+    """Return what the process may use, soft and hard; empty on Windows."""
     if sys.platform == "win32":
-        return None
+        return {}
     import resource
 
-    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return {name: resource.getrlimit(getattr(resource, name)) for name in _LIMITED}
 
 
-def _set_file_limit(limit: int) -> None:
+def _set_limits(limits: dict[str, tuple[int, int]]) -> None:
     if sys.platform == "win32":
         return
     import resource
 
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with suppress(ValueError, OSError):  # `most` was lowered, too, which only root can undo
-        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, most))
+    for name, (soft, hard) in limits.items():
+        limited = getattr(resource, name)
+        try:
+            resource.setrlimit(limited, (soft, hard))
+        except (ValueError, OSError):  # only root can raise the hard limit
+            most = resource.getrlimit(limited)[1]
+            resource.setrlimit(limited, (most, most))
 
 
 def _set_environment(variables: dict[str, str]) -> None:
@@ -147,7 +155,7 @@ class _FloatEnvironment:
 _SETTINGS: dict[str, tuple[Callable[[], Any], Callable[[Any], object]]] = {
     # The first two come first because restoring the others may take calls and files.
     "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
-    "the limit of open files": (_file_limit, _set_file_limit),
+    "the limits of memory and files": (_limits, _set_limits),
     "OpenCV's optimisation": (lambda: _cv2() and _cv2().useOptimized(), lambda value: _cv2().setUseOptimized(value)),
     "OpenCV's threads": (lambda: _cv2() and _cv2().getNumThreads(), lambda value: _cv2().setNumThreads(value)),
     "numpy's handling of errors": (np.geterr, lambda value: np.seterr(**value)),

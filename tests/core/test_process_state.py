@@ -58,7 +58,7 @@ def test_a_lower_limit_of_open_files_is_undone() -> None:
     with restored_state() as found:
         resource.setrlimit(resource.RLIMIT_NOFILE, (5, before[1]))
     assert resource.getrlimit(resource.RLIMIT_NOFILE) == before
-    assert found == ["the limit of open files"]
+    assert found == ["the limits of memory and files"]
 
 
 def test_windows_has_its_floating_point_modes_in_a_library_of_that_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,7 +105,8 @@ FATAL = {
     "deep lines for us": (WRITE_TO_ALL.format(line=r"b'[' * 60_000 + b'\n'"), r"cannot be read \(RecursionError"),
     "memory": (
         "import resource\nused = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20),) * 2)\nblocks = []\n"
+        "hard = resource.getrlimit(resource.RLIMIT_AS)[1]\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20), hard))\nblocks = []\n"
         "while True: blocks.append(bytearray(1000))",
         "MemoryError|worker process died",
     ),
