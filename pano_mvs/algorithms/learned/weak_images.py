@@ -32,8 +32,8 @@ def weak_images(
     """Find the images that are not placed firmly by matches without a network.
 
     An image is placed firmly if it is in the group of poses that has most images of the capture, and if two or more
-    pairs that agree with the poses connect it with most others across every cut between them. Doubts do not count: they
-    mostly come from structure that repeats, which deceives networks as well.
+    pairs connect it with most others across every cut between them. Pairs count if one of their geometries agrees with
+    the poses. Doubts do not count: they mostly come from structure that repeats, which deceives networks as well.
 
     Args:
         features: key points of all images, in the capture's order.
@@ -67,11 +67,13 @@ def _firmly_placed(poses: Poses, matches: Mapping[tuple[str, str], TwoView], *, 
     names = group.names
     place = {name: idx for idx, name in enumerate(names)}
     model = PlacedModel(Pairs.without(names), {idx: group.cam_from_world(idx) for idx in place.values()})
-    edges = [
-        (place[first], place[second])
-        for (first, second), view in matches.items()
-        if view and place.keys() >= {first, second} and model.agrees_with((place[first], place[second]), view)
-    ]
+    edges = []
+    for (first, second), view in matches.items():
+        if view and place.keys() >= {first, second}:
+            edge = place[first], place[second]
+            # Where structure repeats, most pairs have the right geometry among their alternatives.
+            if any(model.agrees_with(edge, geometry) for geometry in (view, *view.alternatives)):
+                edges.append(edge)
     # One pair leaves the distance open, two give ten equations for six unknowns; two images have one pair at most.
     firm = _largest(edges if count == 2 else _without_bridges(edges, len(names)), len(names))
     return {names[idx] for idx in firm} if 2 * len(firm) > count else set()

@@ -111,6 +111,13 @@ def test_pairs_that_contradict_the_poses_hold_nothing() -> None:
     assert weak(RING | pairs("bf") | turned) == "a"
 
 
+def test_an_alternative_geometry_that_agrees_holds_as_well() -> None:
+    """Regression: in a hall with a tiled floor, all nine images were weak that SIFT had placed."""
+    right = RING["a", "b"]
+    among = replace(right, direction=-right.direction).with_alternatives([right])
+    assert weak(RING | {("a", "b"): among}) == ""
+
+
 def test_a_doubt_is_no_reason() -> None:
     """Where structure repeats, networks are deceived, too: of nine right cameras of a hall, two became wrong."""
     assert weak(RING, replace(placed(), doubts={"c": "the place repeats"})) == ""
