@@ -488,6 +488,8 @@ def test_paths_in_files_and_on_the_command_line(
         ("many.limit=!!python/name:os.system", "is not allowed; write a plain value"),
         ("many.use=test.man", "--set many.use: stage 'many': there is no stage 'test.man'; did you mean 'test.many'"),
         ("many.use=[1]", "--set many.use: stage 'many': there is no stage [1]"),
+        ("use=null", "no stage 'use'"),
+        (".use=x", "no stage ''"),
         ("many.use=null", "--set many.use: stage 'many': there is no stage None"),
         ("many.gate.x={min: 2, max: 1}", "min 2 is larger than max 1: nothing would pass"),
         ("many.gate.x={}", "give {min: …}, {max: …} or both"),
