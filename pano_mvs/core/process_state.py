@@ -90,7 +90,7 @@ def _limits() -> dict[str, tuple[int, int]]:
         return {}
     import resource
 
-    return {name: resource.getrlimit(getattr(resource, name)) for name in _LIMITED}
+    return {name: resource.getrlimit(getattr(resource, name)) for name in _LIMITED if hasattr(resource, name)}
 
 
 def _set_limits(limits: dict[str, tuple[int, int]]) -> None:
@@ -104,7 +104,9 @@ def _set_limits(limits: dict[str, tuple[int, int]]) -> None:
             resource.setrlimit(limited, (soft, hard))
         except (ValueError, OSError):  # only root can raise the hard limit
             most = resource.getrlimit(limited)[1]
-            resource.setrlimit(limited, (most, most))
+            is_possible = soft != resource.RLIM_INFINITY and soft <= most
+            with suppress(ValueError, OSError):
+                resource.setrlimit(limited, (soft if is_possible else most, most))
 
 
 def _set_environment(variables: dict[str, str]) -> None:

@@ -6,6 +6,7 @@ import ctypes
 import locale
 import os
 import random
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable
@@ -74,3 +75,21 @@ def test_windows_has_its_floating_point_modes_in_a_library_of_that_name(monkeypa
     process_state.ProcessState.now().restore()
     monkeypatch.undo()
     assert set(names) == {"ucrtbase"}  # there, None is a TypeError
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
+def test_a_hard_limit_that_stays_low_leaves_the_soft_one_as_near_as_possible() -> None:
+    """In a process of its own, as the limit cannot be raised again by everybody."""
+    code = """
+import resource
+from pano_mvs.core.process_state import restored_state
+kind = resource.RLIMIT_NOFILE
+resource.setrlimit(kind, (200, 400))
+for lowered, expected in ((300, 200), (100, 100)):
+    with restored_state():
+        resource.setrlimit(kind, (50, lowered))
+    soft, hard = resource.getrlimit(kind)
+    assert (soft, hard) in ((200, 400), (expected, lowered)), (soft, hard)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -27,7 +27,7 @@ _OTHERS = {
 _SUFFIXES = {"jpegImage": ".jpg", "pngImage": ".png"}
 _SUFFIX = re.compile(r"\.(jpe?g|png)$", re.IGNORECASE)
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # names of devices in Windows
-_LONGEST_NAME = 80
+_LONGEST_NAME = 80  # bytes, as file systems count
 _NOT_IN_A_NAME = re.compile(r"[^\w.() +-]+")
 
 
@@ -57,8 +57,7 @@ def list_panoramas(path: Path) -> tuple[list[StoredPanorama], list[str]]:
         InputError: if the file cannot be read as E57; it names the file.
     """
     with _opened(path) as file:
-        found = [(name, image) for name, image in _named_images(file) if _is_sphere(image)]
-        panoramas = [_described(name, image, path) for name, image in found]
+        panoramas = [_described(name, image, path) for name, image in _named_images(file)]
         others = Counter(kind for image in _images(file) for node, kind in _OTHERS.items() if image.isDefined(node))
     notes = [
         f"{path.name}: {count} {'image' if count == 1 else 'images'} {kind} {'is' if count == 1 else 'are'} not used: "
@@ -153,15 +152,15 @@ def _named_images(file: Any) -> Iterator[tuple[str, Any]]:
         if not _is_sphere(image):
             continue
         stated = image["name"].value() if image.isDefined("name") else ""
-        stem = _NOT_IN_A_NAME.sub("_", stated).strip(". ")[:_LONGEST_NAME] or f"image_{idx:04d}"
+        written = _NOT_IN_A_NAME.sub("_", stated).strip(". ").encode()[:_LONGEST_NAME].decode(errors="ignore")
+        stem = written or f"image_{idx:04d}"
         suffix = next((suffix for key, suffix in _SUFFIXES.items() if image[_SPHERE].isDefined(key)), ".jpg")
         stem = _SUFFIX.sub("", stem) or stem
         stem = f"image_{stem}" if _RESERVED.fullmatch(stem) else stem
         while stem.casefold() in used:
             stem = f"{stem}_{idx:04d}"
         used.add(stem.casefold())
-        name = f"{stem}{suffix}"
-        yield name, image
+        yield f"{stem}{suffix}", image
 
 
 def _is_sphere(image: Any) -> bool:

@@ -388,12 +388,12 @@ def test_what_an_e57_file_does_not_say_is_unknown(tmp_path: Path) -> None:
             {"name": "c.png", "sphericalRepresentation": sphere(PICTURE), "pose": pose_at(2.0)},
             {"name": "C.jpg", "sphericalRepresentation": sphere(PICTURE)},
             {"name": "con", "sphericalRepresentation": sphere(PICTURE)},
-            {"name": "x" * 240, "sphericalRepresentation": sphere(PICTURE)},
+            {"name": "広" * 240, "sphericalRepresentation": sphere(PICTURE)},
             {"name": "cam 0", "pinholeRepresentation": {"imageWidth": 4}},
         ],
     )
     items = list(list_items(SourceParams(path=path)))
-    named = ["image_0000.png", "a_b_ 1.png", "c.png", "c_0003.png", "C_0004.png", "image_con.png", f"{'x' * 80}.png"]
+    named = ["image_0000.png", "a_b_ 1.png", "c.png", "c_0003.png", "C_0004.png", "image_con.png", f"{'広' * 26}.png"]
     assert [item.name for item in items] == named
     assert not any(item.problem for item in items)
     note = "scan.e57: 1 image of a pinhole camera is not used: only spherical images are panoramas"
