@@ -149,7 +149,7 @@ def _named_images(file: Any) -> Iterator[tuple[str, Any]]:
     """Yield the spherical images with unique names: images need none, and several may have the same."""
     used = set[str]()
     for idx, image in enumerate(_images(file)):
-        if not _is_sphere(image):
+        if not image.isDefined(_SPHERE):
             continue
         stated = image["name"].value() if image.isDefined("name") else ""
         written = _NOT_IN_A_NAME.sub("_", stated).strip(". ").encode()[:_LONGEST_NAME].decode(errors="ignore")
@@ -161,10 +161,6 @@ def _named_images(file: Any) -> Iterator[tuple[str, Any]]:
             stem = f"{stem}_{idx:04d}"
         used.add(stem.casefold())
         yield f"{stem}{suffix}", image
-
-
-def _is_sphere(image: Any) -> bool:
-    return bool(image.isDefined(_SPHERE))
 
 
 def _format(sphere: Any, path: Path, name: str) -> str:
