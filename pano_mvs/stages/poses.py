@@ -108,8 +108,7 @@ def verify(
     Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
     confirm, and the share to be expected. These and the pairs give the probability that the camera is right. A doubtful
     one is moved if the images confirm more of all cameras with another pose that its matches suggest, left out if it is
-    surely wrong, or reported. If the images do not refute the other poses, all are solved again from few pairs, and the
-    images decide. Without features and matches the stage only reports.
+    surely wrong, or reported. Without features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)
@@ -120,13 +119,9 @@ def verify(
         for name, camera in verified.cameras.items()
         if name in cameras and not np.array_equal(cameras[name].center, camera.center)
     ]
-    for what, found in (
-        ("moved to another place", moved),
-        ("placed", [name for name in verified.names if name not in cameras]),
-    ):
-        if found:
-            were = plural(len(found), "was", "were")
-            ctx.note(f"{shortened_list(found)} {were} {what}, where the images confirm more of all cameras")
+    if moved:
+        were = plural(len(moved), "was", "were")
+        ctx.note(f"{shortened_list(moved)} {were} moved to another place, where the images confirm more of all cameras")
     return checked_poses(verified, ctx)
 
 

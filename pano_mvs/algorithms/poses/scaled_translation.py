@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import no_poses, normalised_poses
+from pano_mvs.algorithms.poses.growth_by_images import model_by_images, repeats
 from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import why_no_pair
 from pano_mvs.algorithms.poses.solved_models import solved_models
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.correct_cameras import check_cameras
-from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
@@ -41,8 +41,8 @@ def solve_scaled_translation(
     views that all see the first image to an unordered set. Starting from a seed pair, each image is placed by the
     rotations and directions of its pairs with registered images. The length of a translation is the one that puts
     points with known ranges at these ranges. All geometries of a pair are considered, not only the one with most
-    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where many pairs have several
-    geometries, the images weigh these (see `weighed_by_images`).
+    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where structure repeats, the
+    images choose (see `model_by_images`).
 
     Args:
         features: key points by image name, in the capture's order.
@@ -59,11 +59,14 @@ def solve_scaled_translation(
     """
     del rng
     names = tuple(features)
-    pairs = pairs_of(features, two_views, scale_of=partial(estimate_scale, estimator=scale_estimator, kappa=kappa))
-    confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
-    if confirmation is not None:
-        pairs = weighed_by_images(pairs, confirmation)
-    models, reasons = solved_models(pairs, adjust=adjust)
+    scale_of = partial(estimate_scale, estimator=scale_estimator, kappa=kappa)
+    pairs = pairs_of(features, two_views, scale_of=scale_of, consistent=False)
+    consistent = pairs.consistent()
+    if load is None or not repeats(pairs, consistent):
+        models, reasons = solved_models(consistent, adjust=adjust)
+    else:
+        confirmation = Confirmation(lambda image: load(names[image]))
+        models, reasons = solved_models(pairs, adjust=adjust, grow=partial(model_by_images, confirmation=confirmation))
     groups = [_finished(model, adjust=adjust) for model in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"

@@ -39,7 +39,7 @@ def gathered(view: TwoView = TRUE, *, image: int = 1, ranges: list[np.ndarray] =
         [partner],
         geometries={(0, 1): geometries_of(view, *BEARINGS)},
         cameras={partner: (FIRST, SECOND)[partner]},
-        ranges=[known if idx == partner else np.full(len(POINTS), np.nan) for idx, known in enumerate(ranges)],
+        ranges={partner: ranges[partner]},
     )
 
 
@@ -133,7 +133,7 @@ def test_parallax_is_the_angle_between_rays_after_derotation() -> None:
 
 
 def test_no_partner_is_no_evidence() -> None:
-    says = gather_pair_evidence(0, [], geometries={}, cameras={}, ranges=RANGES)
+    says = gather_pair_evidence(0, [], geometries={}, cameras={}, ranges={})
     assert len(says) == 0
     assert says.total == 0
     assert says.rotations.shape == (0, 3, 3)

@@ -159,7 +159,7 @@ def gather_pair_evidence(
     *,
     geometries: Mapping[Edge, tuple[Geometry, ...]],
     cameras: Mapping[int, Rigid3],
-    ranges: Sequence[FloatArray],
+    ranges: Mapping[int, FloatArray],
     scale_of: ScaleOf = estimate_scale,
 ) -> PairEvidence:
     """Return the evidence of the pairs of an image with registered partners.
@@ -169,7 +169,7 @@ def gather_pair_evidence(
         partners: registered images that share a pair with it.
         geometries: of all pairs (i, j), i < j.
         cameras: cam_from_world of registered images.
-        ranges: (N,) known range of every image's key points in scene units, NaN where unknown.
+        ranges: (N,) known ranges of every partner's key points in scene units, NaN where unknown.
         scale_of: estimates a length from the ratios of known ranges.
     """
     rows = []

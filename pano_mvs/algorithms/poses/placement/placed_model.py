@@ -77,6 +77,13 @@ class Pairs:
                     found[edge] = weight
         return found
 
+    def consistent(self) -> Pairs:
+        """Return the pairs without those whose rotations contradict those of other pairs."""
+        names = self.names
+        views = {(names[a], names[b]): view for (a, b), view in (self.compared or {}).items()}
+        kept = consistent_edges(names, views)
+        return replace(self, geometries={edge: self.geometries[edge] for edge in kept})
+
     @staticmethod
     def without(names: Sequence[str]) -> Pairs:
         """Return pairs without key points and matches, for images of which only the names are known."""
@@ -88,20 +95,26 @@ def pairs_of(
     two_views: Mapping[tuple[str, str], TwoView],
     *,
     scale_of: ScaleOf = estimate_scale,
+    consistent: bool = True,
 ) -> Pairs:
-    """Return the pairs of a capture, with all geometries; pairs whose rotations contradict other pairs are left out.
+    """Return the pairs of a capture, with all geometries.
 
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
         scale_of: estimates translation scale factors from the ratios of single features.
+        consistent: whether to leave out pairs whose rotations contradict those of other pairs.
     """
     names = tuple(features)
+    compared = views_by_position(names, two_views)
+    edges = (
+        consistent_edges(names, two_views) if consistent else {edge: view for edge, view in compared.items() if view}
+    )
     geometries = {
         (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
-        for (a, b), view in consistent_edges(names, two_views).items()
+        for (a, b), view in edges.items()
     }
-    return Pairs(features, geometries, scale_of, views_by_position(names, two_views))
+    return Pairs(features, geometries, scale_of, compared)
 
 
 @dataclass(eq=False)
@@ -113,6 +126,8 @@ class PlacedModel:
     # pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such a
     # geometry are left out.
     chosen: dict[Edge, int] = field(default_factory=dict)
+    # image position to the ranges (N,) of its key points that images confirm, NaN where unknown; for placing cameras
+    confirmed_ranges: dict[int, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._ranges = [np.full(len(rays), np.nan) for rays in self.pairs.bearings]
@@ -138,14 +153,19 @@ class PlacedModel:
             partners,
             geometries=self.pairs.geometries,
             cameras=self.cameras,
-            ranges=self._ranges,
+            ranges={partner: self._ranges_to_place(partner) for partner in partners},
             scale_of=self.pairs.scale_of,
         )
 
-    def place(self, image: int) -> tuple[PairEvidence, list[Placement]]:
+    def _ranges_to_place(self, image: int) -> FloatArray:
+        """Return the ranges of all key points of an image, those of triangulated points first."""
+        own = self._ranges[image]
+        return np.where(np.isfinite(own), own, self.confirmed_ranges[image]) if image in self.confirmed_ranges else own
+
+    def place(self, image: int, *, most: int = 6) -> tuple[PairEvidence, list[Placement]]:
         """Return the evidence of the pairs of an image for its pose, and the poses on which they agree, best first."""
         evidence = self.evidence(image)
-        return evidence, placements(evidence)
+        return evidence, placements(evidence, most=most)
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image, choose the geometries of its pairs that agree, and update ranges from them."""
@@ -207,7 +227,7 @@ class PlacedModel:
         for partner, rank in explained.items():
             view = self.pairs.geometries[_edge(image, partner)][rank].view
             _, matches = oriented(view, partner, image)
-            ranges = self._ranges[partner][matches[:, 0]]
+            ranges = self._ranges_to_place(partner)[matches[:, 0]]
             fresh = np.isfinite(ranges) & ~seen[matches[:, 1]]
             theirs, mine = matches[fresh, 0], matches[fresh, 1]
             seen[mine] = True

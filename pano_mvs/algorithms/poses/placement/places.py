@@ -21,7 +21,7 @@ class Placement:
     score: float  # sum over the partners of the weight of their heaviest geometry that agrees
 
 
-def placements(evidence: PairEvidence) -> list[Placement]:
+def placements(evidence: PairEvidence, *, most: int = 6) -> list[Placement]:
     """Return the distinct poses that the geometries suggest, best score first.
 
     Each geometry with a known length suggests a pose, and so do two intersecting rays. Each candidate is scored by all
@@ -40,8 +40,7 @@ def placements(evidence: PairEvidence) -> list[Placement]:
     scores = best_by_partner(evidence.partner, agree * evidence.weight)
     found: list[Placement] = []
     for idx in np.argsort(-scores, kind="stable"):
-        # Number of candidates that are refined.
-        if len(found) == 6:
+        if len(found) == most:
             break
         pose = _refined(evidence, agree[idx], centers[idx])
         if any(_same(pose, other.cam_from_world, evidence) for other in found):

@@ -87,11 +87,16 @@ class Confirmation:
             small copy is kept.
     """
 
-    def __init__(self, load: Callable[[int], Picture]) -> None:
+    def __init__(self, load: Callable[[int], Picture], *, width_px: int = WIDTH_PX) -> None:
         self._load = load
+        self._width_px = width_px
         self._small: dict[int, _Small] = {}
         self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], RangeMap]]] = OrderedDict()
         self._evidence_of: dict[tuple[tuple[int, ...], ...], list[tuple[list[Rigid3], Evidence]]] = {}
+
+    def at_width(self, width_px: int) -> Confirmation:
+        """Return one of the same capture with smaller or larger sweeps."""
+        return Confirmation(self._load, width_px=width_px)
 
     def shares(self, cameras: Mapping[int, Rigid3], *, independent: bool = False) -> dict[int, float]:
         """Return the share of every camera of a model, by default with one sweep for each; see `evidence`.
@@ -150,15 +155,12 @@ class Confirmation:
         self, image: int, sources: Sequence[int], seen_by: Sequence[Sequence[int]], *, cameras: Mapping[int, Rigid3]
     ) -> Evidence:
         """Return how much of what an image sees its sources confirm, whose maps are swept against other images."""
-        pose = cameras[image]
         small = self.small(image)
         solid_angle = np.broadcast_to(pixel_solid_angle(small.mask.shape)[:, None], small.mask.shape)
         textured = small.textured & small.mask
-        own = self._swept(image, sources, cameras=cameras)
-        maps = [self._swept(source, seeing, cameras=cameras) for source, seeing in zip(sources, seen_by, strict=True)]
-        poses = [cameras[source] for source in sources]
-        confirmed = textured & _confirmed(own, pose, maps, source_poses=poses)
-        classes = _parallax_classes(own.range, pose, poses)
+        own, confirmed = self._map_of(image, sources, seen_by, cameras=cameras)
+        confirmed &= textured
+        classes = _parallax_classes(own.range, cameras[image], [cameras[source] for source in sources])
         return Evidence(
             *(
                 np.histogram(classes[which], _CLASSES, (-0.5, _CLASSES - 0.5), weights=solid_angle[which])[0]
@@ -166,12 +168,31 @@ class Confirmation:
             )
         )
 
+    def _map_of(
+        self, image: int, sources: Sequence[int], seen_by: Sequence[Sequence[int]], *, cameras: Mapping[int, Rigid3]
+    ) -> tuple[RangeMap, NDArray[np.bool_]]:
+        """Return the small map of an image, and which of its pixels its sources confirm."""
+        own = self._swept(image, sources, cameras=cameras)
+        maps = [self._swept(source, seeing, cameras=cameras) for source, seeing in zip(sources, seen_by, strict=True)]
+        return own, _confirmed(own, cameras[image], maps, source_poses=[cameras[source] for source in sources])
+
+    def ranges(self, image: int, cameras: Mapping[int, Rigid3]) -> NDArray[np.float32]:
+        """Return the ranges of a camera of a model that its nearest neighbours confirm, (H, W), NaN elsewhere."""
+
+        def nearest(camera: int) -> list[int]:
+            return nearest_cameras(cameras[camera], {idx: pose for idx, pose in cameras.items() if idx != camera})
+
+        sources = nearest(image)
+        with _one_thread():
+            own, confirmed = self._map_of(image, sources, [nearest(source) for source in sources], cameras=cameras)
+        return np.where(confirmed, own.range, np.float32(np.nan))
+
     def small(self, image: int) -> _Small:
         """Return a panorama at 256 columns."""
         if image not in self._small:
             picture, mask = self._load(image)
-            reduced = reduced_panorama(picture, WIDTH_PX)
-            self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
+            reduced = reduced_panorama(picture, self._width_px)
+            self._small[image] = _Small(reduced, reduced_mask(mask, self._width_px), textured_pixels(reduced))
         return self._small[image]
 
     def _swept(self, image: int, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
@@ -204,7 +225,7 @@ class Confirmation:
             [self.small(idx).image for idx in sources],
             relative,
             near=0.15 * float(np.median(baselines)),
-            far=range_limits(baselines, width=4 * WIDTH_PX)[1],
+            far=range_limits(baselines, width=4 * self._width_px)[1],
             settings=_SETTINGS,
             reference_mask=small.mask,
             source_masks=[self.small(idx).mask for idx in sources],

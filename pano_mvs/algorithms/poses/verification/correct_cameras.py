@@ -124,18 +124,6 @@ def _at_best_place(
     return model.with_cameras(best)
 
 
-def images_decide(model: PlacedModel, confirmation: Confirmation, images: Collection[int]) -> bool:
-    """Return whether the images refute all other places of some images, of a model that is not changed."""
-    if len(model.cameras) < 3:
-        return not images
-    for image in sorted(images):
-        undecided: set[int] = set()
-        best = _at_best_place(model, image, confirmation, found=CameraChecks(), undecided=undecided)
-        if best is not model or undecided:
-            return False
-    return True
-
-
 def check_cameras(model: PlacedModel) -> CameraChecks:
     """Return the evidence of the pairs alone for the cameras of a model, without changing it."""
     found = CameraChecks(asked=False)

@@ -10,17 +10,10 @@ from typing import Annotated
 import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
-from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.placed_model import NO_FEATURES, Pairs, PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.verification.arrangements import (
-    is_better_arrangement,
-    other_arrangements,
-    settled,
-)
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
-from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras, images_decide
+from pano_mvs.algorithms.poses.verification.correct_cameras import CameraChecks, correct_cameras
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -43,10 +36,8 @@ def verify_poses(
     """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
     Every camera is swept with its neighbours at 256 columns. All measurements together give the probability that each
-    camera is right (`docs/method.md`). If the images do not refute the other places of doubtful cameras, the capture is
-    solved again from few pairs, and the arrangement that the images confirm most is kept. Then each doubtful camera is
-    moved to the place with which all cameras are confirmed most. If it is doubtful still, it is reported, or left out
-    if it is as surely wrong as others are right.
+    camera is right (`docs/method.md`). Each doubtful camera is moved to the place with which all cameras are confirmed
+    most. If it is doubtful still, it is reported, or left out if it is as surely wrong as others are right.
 
     Args:
         poses: of any origin. Cameras that are not moved keep their poses exactly.
@@ -58,18 +49,13 @@ def verify_poses(
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares`, `evidence`, `right_probabilities` and `doubts`. Points are
-        triangulated again if a camera was moved or left out. After another solution, frame and
-        unit are its own.
+        triangulated again if a camera was moved or left out.
     """
     if len(poses.names) < 2:
         return poses
     known = {**features, **{name: NO_FEATURES for name in poses.names if name not in features}} if features else {}
     usable = {pair: view for pair, view in (two_views or {}).items() if features and features.keys() >= {*pair}}
     capture = _Capture(load, known, usable, names=poses.names)
-    if correct and capture.pairs.compared and not poses.metric:
-        checked = _verified(poses, capture, correct=False, miss_cost=miss_cost)
-        if not _images_decide(checked, capture):
-            poses = _more_confirmed(checked, capture) or poses
     return _verified(poses, capture, correct=correct, miss_cost=miss_cost)
 
 
@@ -121,33 +107,6 @@ def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost
         moved = replace(poses_of(model), **poses.worlds[0]._asdict())
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     return with_camera_checks(poses, pairs, checks)
-
-
-def _images_decide(poses: Poses, capture: _Capture) -> bool:
-    """Return whether the images refute the other places of all doubtful cameras."""
-    return all(
-        images_decide(capture.model(group), capture.confirmation, [capture.position[name] for name in group.doubts])
-        for group in split_groups(poses)
-    )
-
-
-def _more_confirmed(poses: Poses, capture: _Capture) -> Poses | None:
-    """Return the arrangement of a capture that the images confirm most of those with few pairs; None for its own."""
-    best = None
-    cameras = [{capture.position[name]: pose for name, pose in group.cameras.items()} for group in split_groups(poses)]
-    for models in other_arrangements(capture.features, capture.two_views, capture.pairs):
-        found = [model.cameras for model in models]
-        if is_better_arrangement(found, cameras, capture.confirmation):
-            best, cameras = models, found
-    if best is None:
-        return None
-    if len(best) > 1:
-        joined = [settled(model, capture.pairs) if len(parts) > 1 else model for model, parts in join_models(best)]
-        if is_better_arrangement([model.cameras for model in joined], cameras, capture.confirmation):
-            best = joined
-    groups = [normalised_poses(poses_of(model)) for model in best]
-    missing = dict.fromkeys(capture.names, "the arrangement that the images confirm most has no place for it")
-    return join_groups(groups, order=capture.names, rejected=missing | {**poses.rejected})
 
 
 def poses_of(model: PlacedModel) -> Poses:

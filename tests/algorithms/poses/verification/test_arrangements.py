@@ -6,22 +6,16 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.arrangements import (
     SHARE_STD,
     is_better_arrangement,
     is_more_confirmed,
-    other_arrangements,
     shares_of,
 )
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.algorithms.poses.verification.correct_cameras import correct_cameras
-from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.room_pictures import WHOLE, Vector, moved, room_capture, room_matches
-from tools.benchmarks.belief.families import draw
-from tools.benchmarks.belief.measuring import matched
-from tools.benchmarks.poses.placements import judge_placements
 
 POSES, PICTURES = room_capture()
 AWAY: Vector = (0.5, 0.0, -0.4)
@@ -97,32 +91,3 @@ def test_shares_of_groups_are_those_of_each_group() -> None:
     shares = shares_of(groups, confirmation())
     assert set(shares) == set(cameras)
     assert shares[3] == confirmation().evidence(3, cameras[3], groups[1]).share
-
-
-@pytest.mark.slow
-def test_a_capture_is_solved_again_from_few_pairs_if_the_images_confirm_more() -> None:
-    """Regression: four views of a hall fell into two groups, since false pairs of distant views outvoted right ones."""
-    capture = draw("hall", 9101)
-    features, two_views = matched(capture, learned=False)
-
-    def load(name: str) -> Picture:
-        return capture.pictures[name], np.ones(capture.pictures[name].shape[:2], np.bool_)
-
-    solved = solve_scaled_translation(features, two_views, load=load, rng=np.random.default_rng(1))
-    found = verify_poses(solved, load, features=features, two_views=two_views)
-    placed = judge_placements(found, capture.truth)
-    assert len(found.worlds) == 1
-    assert placed.right.sum() == 4
-    assert not placed.doubted.any()
-
-
-def test_arrangements_come_from_neighbours_in_the_order_of_capture_and_from_the_strongest_pairs() -> None:
-    features, two_views = room_matches()
-    pairs = pairs_of(features, two_views)
-    found = list(other_arrangements(features, two_views, pairs))
-    assert found
-    for models in found:
-        assert all(model.pairs is pairs for model in models)
-        assert {image for model in models for image in model.cameras} <= {*range(len(POSES))}
-    largest = max((model for models in found for model in models), key=lambda model: len(model.cameras))
-    assert len(largest.cameras) == len(POSES)
