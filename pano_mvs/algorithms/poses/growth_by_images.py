@@ -71,13 +71,13 @@ def model_by_images(
         model = _of_neighbours(pairs, images, steps, adjust=adjust)
         if model is not None:
             found = _completed(model, images, small, adjust=adjust)
-            if is_better_arrangement([found[0].cameras], [best[0].cameras], confirmation):
+            if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
                 best = found
     for seed in _seeds(pairs, images, small):
         model = PlacedModel(pairs)
         model.seed(*seed)
         found = _completed(model, images, small, adjust=adjust)
-        if is_better_arrangement([found[0].cameras], [best[0].cameras], confirmation):
+        if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
             best = found
         elif len(images) > _MANY:
             break

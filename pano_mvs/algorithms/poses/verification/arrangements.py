@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation
+from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation, Evidence
 from pano_mvs.geometry import Rigid3
 
 SHARE_STD = 0.02
@@ -16,37 +16,37 @@ CHANCE_SHARE = 0.08
 """What others confirm of a camera in a wrong place: .036 in the median and .073 at most, of 80 in 25 drawn captures; of
 124 right cameras, .085 at least."""
 
-Pair = tuple[str, str]
-
-
-def shares_of(groups: Iterable[Mapping[int, Rigid3]], confirmation: Confirmation) -> dict[int, float]:
-    """Return the confirmed share of every camera of some groups, NaN where too little can be judged.
-
-    In small groups, each camera is confirmed by maps that are swept without it: in shared ones it would confirm itself.
-    """
-    shares: dict[int, float] = {}
-    for cameras in groups:
-        shares |= confirmation.shares(cameras, independent=len(cameras) < SHARED_FROM)
-    return shares
-
 
 def is_better_arrangement(
-    groups: Sequence[Mapping[int, Rigid3]], before: Sequence[Mapping[int, Rigid3]], confirmation: Confirmation
+    cameras: Mapping[int, Rigid3], before: Mapping[int, Rigid3], confirmation: Confirmation
 ) -> bool:
     """Return whether the images confirm one arrangement more than another one, which may have other cameras.
 
     Cameras that are confirmed no more than by chance count as if they were not placed: another source makes any map
-    better, even a source in a wrong place.
+    better, even a source in a wrong place. What has no parallax does not count: cameras of bays that look alike, put
+    into one bay, are so near to one another that much is confirmed, and little seen under a parallax.
     """
-    return is_more_confirmed(*(_shares_beyond_chance(cameras, confirmation) for cameras in (groups, before)))
+    return is_more_confirmed(*(_beyond_chance(each, confirmation) for each in (cameras, before)))
 
 
-def _shares_beyond_chance(groups: Iterable[Mapping[int, Rigid3]], confirmation: Confirmation) -> dict[int, float]:
-    groups = list(groups)
-    shares = shares_of(groups, confirmation)
-    by_chance = {image for image, share in shares.items() if share < CHANCE_SHARE}
-    placed = [{image: pose for image, pose in cameras.items() if image not in by_chance} for cameras in groups]
-    return shares_of(placed, confirmation) if by_chance else shares
+def _beyond_chance(cameras: Mapping[int, Rigid3], confirmation: Confirmation) -> dict[int, float]:
+    evidence = _evidence_of(cameras, confirmation)
+    placed = {image: pose for image, pose in cameras.items() if not evidence[image].share < CHANCE_SHARE}
+    if len(placed) < len(cameras):
+        evidence = _evidence_of(placed, confirmation)
+    return {image: own.parallax_share for image, own in evidence.items()}
+
+
+def _evidence_of(cameras: Mapping[int, Rigid3], confirmation: Confirmation) -> dict[int, Evidence]:
+    """Return what the images confirm of every camera.
+
+    Of few cameras, each is confirmed by maps that are swept without it: in shared ones it would confirm itself.
+    """
+    independent = len(cameras) < SHARED_FROM
+    return {
+        image: confirmation.evidence(image, pose, cameras, independent=independent)
+        for image, pose in sorted(cameras.items())
+    }
 
 
 def is_more_confirmed(shares: Mapping[int, float], before: Mapping[int, float]) -> bool:

@@ -59,6 +59,12 @@ class Evidence:
             return float("nan")
         return float(self.confirmed.sum() / self.textured.sum())
 
+    @property
+    def parallax_share(self) -> float:
+        """The confirmed share of what is textured and seen under a parallax; NaN if that is too little."""
+        seen = self.textured[:-1].sum()
+        return float(self.confirmed[:-1].sum() / seen) if seen >= MIN_TEXTURED * 4 * np.pi else float("nan")
+
     def expected_share(self, others: Sequence[Evidence]) -> float:
         """Return the share that the evidence of other cameras suggests, class by class; NaN without other cameras.
 

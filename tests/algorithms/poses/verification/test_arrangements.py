@@ -10,9 +10,8 @@ from pano_mvs.algorithms.poses.verification.arrangements import (
     SHARE_STD,
     is_better_arrangement,
     is_more_confirmed,
-    shares_of,
 )
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Evidence
 from pano_mvs.algorithms.poses.verification.correct_cameras import correct_cameras
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.room_pictures import WHOLE, Vector, moved, room_capture, room_matches
@@ -55,9 +54,9 @@ def test_a_camera_in_a_wrong_place_makes_an_arrangement_no_better(seed: int) -> 
     turn = rotation_from_rotvec([0.0, rng.uniform(1.0, 5.0), 0.0])
     wrong = Rigid3.from_center(turn @ POSES[3].rotation, POSES[3].center + rng.normal(size=3))
     found = confirmation()
-    assert not is_better_arrangement([{**three, 3: wrong}], [three], found)
-    assert is_better_arrangement([{**three, 3: POSES[3]}], [three], found)
-    assert is_better_arrangement([{**three, 3: POSES[3]}], [{**three, 3: wrong}], found)
+    assert not is_better_arrangement({**three, 3: wrong}, three, found)
+    assert is_better_arrangement({**three, 3: POSES[3]}, three, found)
+    assert is_better_arrangement({**three, 3: POSES[3]}, {**three, 3: wrong}, found)
 
 
 @pytest.mark.slow
@@ -85,9 +84,9 @@ def test_the_images_refute_the_place_that_most_matches_suggest() -> None:
     assert min(np.linalg.norm(pose.center - feigned.center) for pose in checks.refuted[2]) < 0.1
 
 
-def test_shares_of_groups_are_those_of_each_group() -> None:
-    cameras = dict(enumerate(POSES))
-    groups = [{0: cameras[0], 1: cameras[1]}, {2: cameras[2], 3: cameras[3], 4: cameras[4]}]
-    shares = shares_of(groups, confirmation())
-    assert set(shares) == set(cameras)
-    assert shares[3] == confirmation().evidence(3, cameras[3], groups[1]).share
+def test_what_is_seen_without_parallax_does_not_count_for_an_arrangement() -> None:
+    near, far = np.zeros(10), np.zeros(10)
+    near[3], far[-1] = 2.0, 6.0
+    assert Evidence(near + far, near).parallax_share == pytest.approx(1.0)
+    assert Evidence(near + far, near).share == pytest.approx(0.25)
+    assert np.isnan(Evidence(far, far).parallax_share)
