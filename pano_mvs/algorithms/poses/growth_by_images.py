@@ -57,7 +57,8 @@ def model_by_images(
 
     Several models are compared, of which the one whose cameras are confirmed most is returned: one by the pairs alone
     (`grown_model`), those that begin with pairs of neighbours in the order of capture, and those that begin with a seed
-    that both of its images confirm. In larger groups, the first seed that gains nothing is the last one.
+    that both of its images confirm. In larger groups, seeds are used if neighbours gain nothing, and the first one that
+    gains nothing is the last one.
 
     Args:
         pairs: all pairs of the capture.
@@ -66,20 +67,23 @@ def model_by_images(
         adjust: whether all cameras are adjusted as the model grows.
     """
     small = confirmation.at_width(_WIDTH_PX)
-    best = grown_model(pairs, images, adjust=adjust)
+    best = by_pairs = grown_model(pairs, images, adjust=adjust)
     for steps in _STEPS:
         model = _of_neighbours(pairs, images, steps, adjust=adjust)
         if model is not None:
             found = _completed(model, images, small, adjust=adjust)
             if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
                 best = found
+    many = len(images) > _MANY
+    if many and best is not by_pairs:
+        return best
     for seed in _seeds(pairs, images, small):
         model = PlacedModel(pairs)
         model.seed(*seed)
         found = _completed(model, images, small, adjust=adjust)
         if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
             best = found
-        elif len(images) > _MANY:
+        elif many:
             break
     return best
 
