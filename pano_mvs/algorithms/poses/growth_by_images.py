@@ -118,7 +118,7 @@ def _seeds(pairs: Pairs, images: Collection[int], confirmation: Confirmation) ->
 def _of_neighbours(pairs: Pairs, images: Collection[int], steps: int, *, adjust: bool) -> PlacedModel | None:
     """Return the model that grows from pairs of images which are at most some steps apart in the order of capture.
 
-    It has the largest part of the images that such pairs connect; None if they are all pairs, or connect no image.
+    It is None if they are all pairs, or place no more than half of the images.
     """
     inside = {edge for edge in pairs.geometries if set(images).issuperset(edge)}
     near = {edge: pairs.geometries[edge] for edge in inside if edge[1] - edge[0] <= steps}
@@ -126,7 +126,7 @@ def _of_neighbours(pairs: Pairs, images: Collection[int], steps: int, *, adjust:
         return None
     group = connected_groups(near, len(pairs.names))[0]
     cameras = grown_model(replace(pairs, geometries=near), group, adjust=adjust)[0].cameras
-    return PlacedModel(pairs).with_cameras(cameras)
+    return PlacedModel(pairs).with_cameras(cameras) if 2 * len(cameras) > len(images) else None
 
 
 def _completed(
@@ -155,19 +155,37 @@ def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmat
     """
     adjusted = len(model.cameras)
     options: list[_Option] = []
+    changed = set(model.cameras)
     while True:
+        _learn_ranges(model, changed, confirmation)
         options = _options(model, left, confirmation, known=options)
         best = max(options, key=lambda option: (option.share, -option.image), default=None)
         if best is None or best.share < CHANCE_SHARE:
             break
         model.add(best.image, best.pose)
         left.discard(best.image)
+        changed = {best.image} | {idx for idx in model.cameras if best.image in _nearest(model, idx)}
         # The first cameras decide on all others.
         if len(model.cameras) > 1.25 * adjusted or len(model.cameras) < 6:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
+            changed = set(model.cameras)
     refused = {option.image for option in options}
     return dict.fromkeys(refused, "at the places that its pairs suggest, other images confirm nothing of what it sees")
+
+
+def _learn_ranges(model: PlacedModel, cameras: Collection[int], confirmation: Confirmation) -> None:
+    """Compute the ranges of the key points of some cameras again that the images confirm."""
+    for camera in sorted(cameras):
+        ranges = confirmation.ranges(camera, model.cameras)
+        pixels_px = pixel_from_ray(model.pairs.bearings[camera], ranges.shape)
+        columns, rows = np.floor(pixels_px).astype(np.intp).T
+        model.confirmed_ranges[camera] = ranges[rows.clip(0, len(ranges) - 1), columns % ranges.shape[1]]
+
+
+def _nearest(model: PlacedModel, camera: int) -> list[int]:
+    others = {idx: pose for idx, pose in model.cameras.items() if idx != camera}
+    return nearest_cameras(model.cameras[camera], others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,16 +205,11 @@ def _options(
     """Return the places of the images that are connected best with a model; of the next ones if these have none.
 
     Args:
-        model: the model; the ranges of its key points that images confirm are computed again.
+        model: the model.
         images: images that are not in it.
         confirmation: of the capture.
         known: places that were compared before.
     """
-    for camera in model.cameras:
-        ranges = confirmation.ranges(camera, model.cameras)
-        pixels_px = pixel_from_ray(model.pairs.bearings[camera], ranges.shape)
-        columns, rows = np.floor(pixels_px).astype(np.intp).T
-        model.confirmed_ranges[camera] = ranges[rows.clip(0, len(ranges) - 1), columns % ranges.shape[1]]
 
     def places(image: int) -> Iterator[_Option]:
         evidence, found = model.place(image, most=_PLACES)

@@ -157,10 +157,9 @@ def test_where_nothing_repeats_no_image_is_loaded() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("family", "seed", "most_wrong"), [("corridor/large", 9002, 3), ("colonnade/large", 9101, 4)])
-def test_most_cameras_of_a_place_that_repeats_are_right(family: str, seed: int, most_wrong: int) -> None:
-    """By the pairs, 5 of 12 among equal doors and 4 of 15 in a colonnade without anything unique were right."""
-    capture = draw(family, seed)
+def test_most_cameras_among_equal_doors_are_right() -> None:
+    """By the pairs, 5 of 12 were; the images leave one or two in the next bay."""
+    capture = draw("corridor/large", 9002)
     features, views = matched(capture, learned=False)
     poses = solve_scaled_translation(
         features,
@@ -168,8 +167,7 @@ def test_most_cameras_of_a_place_that_repeats_are_right(family: str, seed: int, 
         load=lambda name: (capture.pictures[name], np.ones(capture.pictures[name].shape[:2], np.bool_)),
         rng=np.random.default_rng(1),
     )
-    placed = judge_placements(poses, capture.truth)
-    assert placed.right.sum() >= len(capture.truth) - most_wrong
+    assert judge_placements(poses, capture.truth).right.sum() >= 9
 
 
 @pytest.mark.slow
