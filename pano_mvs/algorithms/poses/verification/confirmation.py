@@ -114,6 +114,13 @@ class Confirmation:
             for image, pose in sorted(cameras.items())
         }
 
+    def parallax_shares(self, cameras: Mapping[int, Rigid3]) -> dict[int, float]:
+        """Return the confirmed share of what every camera of a model sees under a parallax, with one sweep for each."""
+        return {
+            image: self.evidence(image, pose, cameras, independent=False).parallax_share
+            for image, pose in sorted(cameras.items())
+        }
+
     def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
         """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
         return self.evidence(image, pose, cameras).share

@@ -100,7 +100,7 @@ def _at_best_place(
     others = {idx: camera for idx, camera in model.cameras.items() if idx != image}
     without = model.with_cameras(others)
     evidence, places = without.place(image)
-    shares = confirmation.shares(model.cameras)
+    shares = confirmation.parallax_shares(model.cameras)
     best = model.cameras
     refuted = []
     for place in places[:_MAX_PLACES]:
@@ -110,7 +110,7 @@ def _at_best_place(
             continue
         found.compared += 1
         moved = {**others, image: pose}
-        after = confirmation.shares(moved)
+        after = confirmation.parallax_shares(moved)
         if is_more_confirmed(shares, after):
             refuted.append(place.cam_from_world)
         elif support >= points_needed(known) and is_more_confirmed(after, shares):
@@ -200,7 +200,7 @@ def _without_worst(
     if len(cameras) <= 2:
         return None
     if len(cameras) > SOURCES:
-        shares, before = confirmation.shares(cameras), confirmation.shares(model.cameras)
+        shares, before = confirmation.parallax_shares(cameras), confirmation.parallax_shares(model.cameras)
         if is_more_confirmed({image: share for image, share in before.items() if image not in gone}, shares):
             return None
     held = dict.fromkeys(sorted(gone - {worst}), "its pairs are all with images that were left out")
