@@ -120,7 +120,8 @@ def _of_neighbours(pairs: Pairs, images: Collection[int], steps: int, *, adjust:
 
     It is None if they are all pairs, or place no more than half of the images.
     """
-    inside = {edge for edge in pairs.geometries if set(images).issuperset(edge)}
+    members = set(images)
+    inside = [edge for edge in pairs.geometries if members.issuperset(edge)]
     near = {edge: pairs.geometries[edge] for edge in inside if edge[1] - edge[0] <= steps}
     if not near or len(near) == len(inside):
         return None
@@ -137,6 +138,7 @@ def _completed(
     left = set(images) - model.cameras.keys()
     refused = extend_by_images(model, left, confirmation, adjust=adjust)
     settle(model, adjust=adjust)
+    model.confirmed_ranges.clear()  # they belong to the cameras before the last adjustment
     return model, {image: refused.get(image) or why_nothing(model, image) for image in sorted(left)}
 
 

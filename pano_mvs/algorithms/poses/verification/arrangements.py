@@ -14,7 +14,7 @@ SHARE_STD = 0.02
 13 captures, solved and true poses."""
 CHANCE_SHARE = 0.08
 """What others confirm of a camera in a wrong place: .036 in the median and .073 at most, of 80 in 25 drawn captures; of
-124 right cameras, .085 at least."""
+124 right cameras, .085 at least. Measured at 256 columns."""
 
 
 def is_better_arrangement(
@@ -57,7 +57,7 @@ def is_more_confirmed(shares: Mapping[int, float], before: Mapping[int, float]) 
     in a wrong place, but hardly all of them together.
 
     Args:
-        shares: image position to the confirmed share of its textured pixels; NaN counts as nothing.
+        shares: image position to the confirmed share of what it sees under a parallax; NaN counts as nothing.
         before: those of the other arrangement.
     """
     images = sorted(shares.keys() | before.keys())
