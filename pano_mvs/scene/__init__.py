@@ -3,7 +3,7 @@
 from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features, GlobalDescriptor, WeakImage, WeakImages
 from pano_mvs.scene.files import Files
-from pano_mvs.scene.panorama import Panorama
+from pano_mvs.scene.panorama import Panorama, SceneLink
 from pano_mvs.scene.poses import Pose, Poses, WorldAxes
 from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
@@ -25,6 +25,7 @@ __all__ = [
     "Poses",
     "RangeMap",
     "Record",
+    "SceneLink",
     "Scores",
     "TwoView",
     "TwoViews",

@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
-from typing import ClassVar, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import cv2
 import numpy as np
@@ -55,6 +55,22 @@ class RecentPictures:
                 self._pictures.popitem(last=False)
 
 
+class SceneLink(NamedTuple):
+    """A link to another panorama, such as a hotspot of a virtual tour."""
+
+    name: str  # of the panorama to which it leads
+    # where it stands in the picture, in degrees to the right of its middle and above the horizon; None if not known
+    direction_deg: tuple[float, float] | None = None
+
+    @classmethod
+    def from_value(cls, value: Any) -> Self:
+        """Return the link from a name, or from JSON of a link."""
+        if isinstance(value, str):
+            return cls(value)
+        name, direction_deg = value
+        return cls(name, None if direction_deg is None else tuple(direction_deg))
+
+
 _OF_SOME = frozenset({"rig", "first_lens", "second_lens", "links"})
 _RECENT = RecentPictures(limit_bytes=48 << 20)
 
@@ -80,7 +96,7 @@ class Panorama(Record):
         rig: the lenses from whose pictures the panorama was stitched, or None if they are not known.
         first_lens: the file with the picture of the rig's first lens, or None without a rig.
         second_lens: the file of the second lens; None if `first_lens` shows both side by side.
-        links: names of panoramas that are known to lie nearby, such as those to which a scene of a tour leads.
+        links: to other panoramas that are known to lie nearby, such as those to which a scene of a tour leads.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -99,7 +115,7 @@ class Panorama(Record):
     rig: LensRig | None = None
     first_lens: FilePart | None = None
     second_lens: FilePart | None = None
-    links: tuple[str, ...] = ()
+    links: tuple[SceneLink, ...] = ()
 
     def to_parts(self) -> Parts:
         """Return the panorama with its rig as JSON; nothing is stored about a rig or links that it does not have."""
@@ -117,7 +133,8 @@ class Panorama(Record):
         meta = parts["meta"]
         assert isinstance(meta, dict)
         rig = meta.get("rig")
-        return panorama if rig is None else replace(panorama, rig=LensRig.from_values(rig))
+        links = tuple(SceneLink.from_value(link) for link in panorama.links)
+        return replace(panorama, links=links, rig=None if rig is None else LensRig.from_values(rig))
 
     def check(self) -> None:
         """Raise ContractError unless the sizes are those of full spheres."""

@@ -76,7 +76,7 @@ def automatic(
         positions = gps_positions(images) if poses is None else dict(zip(poses.names, poses.centers, strict=True))
     else:
         positions = {}
-    links = {name: image.links for name, image in images.items() if image.links}
+    links = {name: [link.name for link in image.links] for name, image in images.items() if image.links}
     pairs, reason = automatic_pairs(descriptors, positions, links, **settings)
     ctx.metric("pairs", len(pairs.pairs))
     if reason:

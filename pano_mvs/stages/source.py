@@ -286,7 +286,7 @@ def list_tour(params: TourParams) -> Iterator[SourceItem]:
         scene.name: f"{scene.name}{'.png' if scene.panorama is None else scene.panorama.suffix}" for scene in scenes
     }
     for scene in scenes:
-        links = tuple(items[name] for name in scene.links)
+        links = tuple(link._replace(name=items[link.name]) for link in scene.links)
         yield SourceItem(items[scene.name], _files_of(scene), notes=tuple(notes), links=links)
 
 

@@ -19,7 +19,7 @@ from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.core.settings import settings_of
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params, settings_model
-from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
+from pano_mvs.scene import Axis, FilePart, Pairs, Record, SceneLink, Views
 
 
 class Cardinality(StrEnum):
@@ -99,7 +99,7 @@ class SourceItem:
         problem: why the item cannot be used, if that is known when it is listed.
         notes: what a user should know in every run, even if the result is cached, such as notes on the location of
             files, which is not part of the key.
-        links: names of items that are known to lie nearby, as the links of a virtual tour say; part of the key.
+        links: to other items that are known to lie nearby, as those of a virtual tour; part of the key.
         digests: role to the digest of the file when it was listed; filled in by the engine.
     """
 
@@ -107,7 +107,7 @@ class SourceItem:
     files: Mapping[str, Path]
     problem: str = ""
     notes: tuple[str, ...] = ()
-    links: tuple[str, ...] = ()
+    links: tuple[SceneLink, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
 
     def file(self, role: str) -> FilePart:

@@ -11,6 +11,7 @@ What a configuration states is not trusted: a path is only a text, which `tours`
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,14 @@ NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top":
 _MAX_LEVELS = 24  # of 512 px tiles, this is more than 10^9 px along an edge
 
 
+class StatedLink(NamedTuple):
+    """A link to another scene."""
+
+    target: str  # key of the scene
+    # where it stands in the picture, in degrees to the right of its middle and above the horizon; None if not stated
+    direction_deg: tuple[float, float] | None = None
+
+
 class Grid(NamedTuple):
     """A cube in one resolution."""
 
@@ -41,7 +50,7 @@ class StatedScene:
 
     key: str  # its identifier, to which links refer
     title: str  # its name for people; may be empty
-    links: tuple[str, ...]  # keys of the scenes to which it leads
+    links: tuple[StatedLink, ...]
     grids: tuple[Grid, ...] = ()  # resolutions of its cube, the finest first
     panorama: str = ""  # path of an equirectangular image, or ""
 
@@ -121,7 +130,10 @@ def _marzipano(data: Any) -> Iterator[StatedScene]:
             if not level.get("fallbackOnly"):
                 side = _tiles(_number(level, "size"), _number(level, "tileSize"))
                 grids.append(Grid(side, _expanded(f"tiles/{key}/%l/%s/%y/%x.jpg", level=number, first=0)))
-        links = [_text(link, "target") for link in _objects(scene.get("linkHotspots"))]
+        links = [
+            StatedLink(_text(link, "target"), _direction(link, "yaw", "pitch", unit_deg=math.degrees(1), up=-1))
+            for link in _objects(scene.get("linkHotspots"))
+        ]
         yield StatedScene(key, _text(scene, "name"), tuple(links), tuple(grids), _text(scene, "panorama"))
 
 
@@ -129,7 +141,10 @@ def _pannellum(config: Any) -> Iterator[StatedScene]:
     scenes, default = _get(config, "scenes"), _get(config, "default")
     for key, stated in (scenes if isinstance(scenes, dict) else {}).items():
         scene = (default if isinstance(default, dict) else {}) | (stated if isinstance(stated, dict) else {})
-        links = tuple(_text(spot, "sceneId") for spot in _objects(scene.get("hotSpots")))
+        links = tuple(
+            StatedLink(_text(spot, "sceneId"), _direction(spot, "yaw", "pitch"))
+            for spot in _objects(scene.get("hotSpots"))
+        )
         base, kind, grids, panorama = _text(scene, "basePath"), _text(scene, "type"), list[Grid](), ""
         if kind == "multires" and isinstance(tiles := scene.get("multiRes"), dict):
             path = _text(tiles, "basePath")
@@ -154,7 +169,10 @@ def _krpano(root: ElementTree.Element) -> Iterator[StatedScene]:
             grids += _krpano_grids(image)
             panorama = panorama or next((url for sphere in image.iter("sphere") if (url := sphere.get("url"))), "")
         name = scene.get("name") or ""
-        links = tuple((spot.get("linkedscene") or "").casefold() for spot in scene.iter("hotspot"))
+        links = tuple(
+            StatedLink((spot.get("linkedscene") or "").casefold(), _direction(spot.attrib, "ath", "atv", up=-1))
+            for spot in scene.iter("hotspot")
+        )
         # A cube of six files has no stated size, and stands beside a finer one of tiles, for devices with less memory.
         grids.sort(key=lambda grid: grid.side, reverse=True)
         yield StatedScene(name.casefold(), scene.get("title") or name, links, tuple(grids), panorama)
@@ -223,6 +241,27 @@ def _objects(value: Any) -> Iterable[dict[str, Any]]:
 def _text(value: Mapping[str, Any], key: str) -> str:
     found = value.get(key)
     return str(found) if isinstance(found, (str, int)) else ""
+
+
+def _direction(
+    value: Mapping[str, Any], right: str, up_or_down: str, *, unit_deg: float = 1.0, up: int = 1
+) -> tuple[float, float] | None:
+    """Return a direction in degrees, from -180 to 180 to the right and upwards; None if it is not stated.
+
+    Args:
+        value: has both angles.
+        right: key of the angle to the right.
+        up_or_down: key of the angle above or below the horizon.
+        unit_deg: unit of the angles.
+        up: 1 if angles above the horizon are positive, -1 if those below it are.
+    """
+    try:
+        yaw, pitch = (float(value[key]) * unit_deg for key in (right, up_or_down))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    if not (abs(yaw) < 1e6 and abs(pitch) <= 90):
+        return None
+    return (yaw + 180) % 360 - 180, up * pitch
 
 
 def _number(value: Mapping[str, Any], key: str) -> float:

@@ -26,6 +26,7 @@ from pano_mvs.io.images.captures import (
 )
 from pano_mvs.io.images.names import match_image_names, without_extension
 from pano_mvs.io.images.tour_configurations import FACES, NAMES, Grid, StatedScene, stated_scenes
+from pano_mvs.scene import SceneLink
 
 Tiles: TypeAlias = dict[tuple[str, int, int], Path]
 
@@ -55,7 +56,7 @@ class TourScene:
     # file of each tile of the finest complete resolution, by face, row and column, which count from 0; empty for an
     # equirectangular image
     tiles: Mapping[tuple[str, int, int], Path]
-    links: tuple[str, ...] = ()  # names of the scenes to which it leads
+    links: tuple[SceneLink, ...] = ()  # to other scenes, by their names
     panorama: Path | None = None  # its equirectangular image, or None for a cube
 
 
@@ -229,9 +230,12 @@ def _stated(capture: _Capture, notes: list[str], unreadable: list[str]) -> Itera
     by_key = {scene.key: name for (_, scene, _, _), name in zip(reversed(scenes), reversed(names), strict=True)}
     by_file = {(file, scene.key): name for (file, scene, _, _), name in zip(scenes, names, strict=True)}
     for (file, scene, tiles, panorama), name in zip(scenes, names, strict=True):
-        links = (by_file.get((file, key)) or by_key.get(key) for key in scene.links)
-        others = dict.fromkeys(link for link in links if link and link != name)
-        yield TourScene(name, tiles, tuple(others), panorama)
+        links: dict[str, SceneLink] = {}
+        for link in scene.links:
+            target = by_file.get((file, link.target)) or by_key.get(link.target)
+            if target and target != name and (target not in links or links[target].direction_deg is None):
+                links[target] = SceneLink(target, link.direction_deg)
+        yield TourScene(name, tiles, tuple(links.values()), panorama)
 
 
 def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Tiles, Path | None]:

@@ -13,8 +13,18 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import item_problem, plain_title
 from pano_mvs.io.images.tours import TourScene, is_tour, list_scenes
 from pano_mvs.io.tour_players import Link, Scene, krpano_tour, marzipano_data, pannellum_tour
+from pano_mvs.scene import SceneLink
 from pano_mvs.stages.source import TourParams, list_tour
-from tests.io.images.tours import CONFIGURATIONS, SIDE, face_of, write, write_configuration, write_tour
+from tests.io.images.tours import (
+    CONFIGURATIONS,
+    PITCH_DEG,
+    SIDE,
+    YAW_DEG,
+    face_of,
+    write,
+    write_configuration,
+    write_tour,
+)
 
 KEYS = ("a", "b", "c")
 
@@ -23,18 +33,23 @@ def scenes_of(folder: Path) -> list[TourScene]:
     return list_scenes(folder, [])
 
 
+def targets(scene: TourScene) -> tuple[str, ...]:
+    return tuple(link.name for link in scene.links)
+
+
 @pytest.mark.parametrize("program", CONFIGURATIONS)
 def test_titles_order_and_links_come_from_the_configuration(tmp_path: Path, program: str) -> None:
     write_tour(tmp_path, program, KEYS)
     write_configuration(tmp_path, program, {"c": "Kitchen", "a": "Hall: 1/2", "b": ""}, links={"c": ["a", "b", "gone"]})
     scenes = scenes_of(tmp_path)
     assert [scene.name for scene in scenes] == ["Kitchen", "Hall 1 2", "b"]
-    assert [scene.links for scene in scenes] == [("Hall 1 2", "b"), (), ()]
+    assert [targets(scene) for scene in scenes] == [("Hall 1 2", "b"), (), ()]
+    assert np.allclose([link.direction_deg for link in scenes[0].links], [[YAW_DEG, PITCH_DEG]] * 2)
     assert all(len(scene.tiles) == 24 for scene in scenes)
     assert is_tour(tmp_path)
     items = list(list_tour(TourParams.model_validate({"path": tmp_path})))
     assert items[0].name == "Kitchen.png"
-    assert items[0].links == ("Hall 1 2.png", "b.png")
+    assert [link.name for link in items[0].links] == ["Hall 1 2.png", "b.png"]
     assert "2 links between them" in items[0].notes[-1]
 
 
@@ -43,8 +58,30 @@ def test_scenes_without_pictures_are_named(tmp_path: Path, program: str) -> None
     write_tour(tmp_path, program, KEYS[:2])
     write_configuration(tmp_path, program, {"a": "Hall", "b": "Kitchen", "c": "Cellar"}, links={"a": ["c"]})
     notes: list[str] = []
-    assert [(scene.name, scene.links) for scene in list_scenes(tmp_path, notes)] == [("Hall", ()), ("Kitchen", ())]
+    assert [(scene.name, targets(scene)) for scene in list_scenes(tmp_path, notes)] == [("Hall", ()), ("Kitchen", ())]
     assert notes == ["1 scenes have no complete cube here and are skipped: Cellar"]
+
+
+@pytest.mark.parametrize(
+    ("spot", "direction_deg"),
+    [
+        ({"yaw": 190, "pitch": 10}, (-170.0, 10.0)),
+        ({"yaw": "-30", "pitch": "0"}, (-30.0, 0.0)),
+        ({"yaw": 20}, None),
+        ({"yaw": "left", "pitch": 0}, None),
+        ({"yaw": float("nan"), "pitch": 0}, None),
+        ({"yaw": 0, "pitch": 91}, None),
+    ],
+)
+def test_a_link_has_the_stated_direction_or_none(
+    tmp_path: Path, spot: dict[str, object], direction_deg: tuple[float, float] | None
+) -> None:
+    write_tour(tmp_path, "Pannellum", KEYS[:2])
+    write_configuration(tmp_path, "Pannellum", {"a": "Hall", "b": "Kitchen"}, {"b": ["a"]})
+    stated = json.loads((tmp_path / "tour.json").read_text())
+    stated["scenes"]["b"]["hotSpots"] = [{"sceneId": "a"}, {"sceneId": "a", **spot}]
+    (tmp_path / "tour.json").write_text(json.dumps(stated))
+    assert scenes_of(tmp_path)[1].links == (SceneLink("Hall", direction_deg),)
 
 
 def test_scenes_with_one_title_are_told_apart(tmp_path: Path) -> None:
@@ -65,7 +102,7 @@ def test_two_tours_in_one_folder_keep_their_own_links(tmp_path: Path) -> None:
     for floor in ("1", "2"):
         write_tour(tmp_path / floor, "Marzipano", ("a", "b"))
         write_configuration(tmp_path / floor, "Marzipano", {"a": f"Hall {floor}", "b": f"Room {floor}"}, {"a": ["b"]})
-    links = {scene.name: scene.links for scene in scenes_of(tmp_path)}
+    links = {scene.name: targets(scene) for scene in scenes_of(tmp_path)}
     assert links == {"Hall 1": ("Room 1",), "Room 1": (), "Hall 2": ("Room 2",), "Room 2": ()}
 
 
@@ -85,7 +122,7 @@ def test_a_formatted_script_is_read(tmp_path: Path) -> None:
         "linkHotspots: [{ target: 'b', yaw: -1.5e-1, icon: picture },] },\n"
         "{ id: 'b', name: 'It\\'s: {here', levels: [], },\n],\n};\nvar more = {};\n"
     )
-    assert [(scene.name, scene.links) for scene in scenes_of(tmp_path)] == [
+    assert [(scene.name, targets(scene)) for scene in scenes_of(tmp_path)] == [
         ("The old hall", ("It's {here",)),
         ("It's {here", ()),
     ]
@@ -97,7 +134,7 @@ def test_a_tour_in_a_page_is_read(tmp_path: Path) -> None:
     stated = (tmp_path / "tour.json").read_text()
     (tmp_path / "tour.json").unlink()
     (tmp_path / "index.html").write_text(f"<script>viewer = pannellum.viewer('panorama', {stated});</script>")
-    assert [(scene.name, scene.links) for scene in scenes_of(tmp_path)] == [("Hall", ()), ("Kitchen", ("Hall",))]
+    assert [(scene.name, targets(scene)) for scene in scenes_of(tmp_path)] == [("Hall", ()), ("Kitchen", ("Hall",))]
 
 
 def test_the_finest_resolution_is_used_even_if_a_coarser_one_is_stated(tmp_path: Path) -> None:
@@ -130,7 +167,7 @@ def test_cubes_of_six_files_are_read_by_their_places_in_the_configuration(tmp_pa
     )
     scenes = {scene.name: scene for scene in scenes_of(tmp_path)}
     assert set(scenes) == {"X", "Y", "a", "b"}
-    assert scenes["Y"].links == ("X",)
+    assert targets(scenes["Y"]) == ("X",)
     assert {face: path.name for (face, _, _), path in scenes["a"].tiles.items()} == {
         face: f"a{number}.png" for number, face in enumerate("frblud")
     }
@@ -184,7 +221,7 @@ def test_titles_and_links_survive_other_paths_and_levels(
     renamed(tmp_path, program, change)
     notes: list[str] = []
     scenes = list_scenes(tmp_path, notes)
-    assert [(scene.name, scene.links, len(scene.tiles)) for scene in scenes] == [
+    assert [(scene.name, targets(scene), len(scene.tiles)) for scene in scenes] == [
         ("Kitchen", ("Hall", "Attic"), 24),
         ("Hall", (), 24),
         ("Attic", (), 24),
@@ -204,7 +241,7 @@ def test_panoramas_and_six_files_are_found_by_their_names(tmp_path: Path) -> Non
         files = [f"{base}{key}/{face}.png" for face in "frblud"]
         stated[f"cube {key}"] = {"type": "cubemap", "cubeMap": files, "hotSpots": [{"sceneId": "a"}]}
     (tmp_path / "tour.json").write_text(json.dumps({"scenes": stated}))
-    assert [(scene.name, scene.links, len(scene.tiles)) for scene in scenes_of(tmp_path)] == [
+    assert [(scene.name, targets(scene), len(scene.tiles)) for scene in scenes_of(tmp_path)] == [
         ("aaa", (), 0),
         ("bbb", (), 0),
         ("cube a", ("aaa",), 6),
@@ -233,10 +270,11 @@ WRITERS: dict[str, Callable[[list[Scene]], str]] = {
 def test_our_own_exports_are_read(tmp_path: Path, file: str) -> None:
     for number in range(2):
         write(tmp_path / f"pictures/no {number}.jpg", np.tile(face_of("f"), (1, 2, 1)))
-    made = [Scene(f"Room {n}", f"pictures/no {n}.jpg", 128, None, (Link(1 - n, 0.0, 0.0, 0.0),)) for n in range(2)]
+    made = [Scene(f"Room {n}", f"pictures/no {n}.jpg", 128, None, (Link(1 - n, 150.0, -20.0, 0.0),)) for n in range(2)]
     (tmp_path / file).write_text(WRITERS[file](made))
     scenes = scenes_of(tmp_path)
-    assert [(scene.name, scene.links) for scene in scenes] == [("Room 0", ("Room 1",)), ("Room 1", ("Room 0",))]
+    assert [(scene.name, targets(scene)) for scene in scenes] == [("Room 0", ("Room 1",)), ("Room 1", ("Room 0",))]
+    assert np.allclose([link.direction_deg for scene in scenes for link in scene.links], [[150.0, -20.0]] * 2)
     assert [scene.panorama for scene in scenes] == [tmp_path / f"pictures/no {n}.jpg" for n in range(2)]
     assert not is_tour(tmp_path), "source.folder reads panoramas without a change"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -59,6 +60,9 @@ def write_tour(folder: Path, layout: str, scenes: tuple[str, ...] = ("1-hall", "
 CONFIGURATIONS: dict[str, str] = {"Marzipano": "app-files/data.js", "Pannellum": "tour.json", "krpano": "tour.xml"}
 """Where the configuration of a tour is."""
 
+YAW_DEG, PITCH_DEG = 30.0, -12.0
+"""Direction of all links of a configuration."""
+
 
 def write_configuration(
     folder: Path, program: str, titles: Mapping[str, str], links: Mapping[str, Sequence[str]]
@@ -66,10 +70,16 @@ def write_configuration(
     """Write the configuration of a tour of `write_tour`, with a title and links for each scene."""
     half = SIDE // 2
     if program == "Marzipano":
+        place = {"yaw": math.radians(YAW_DEG), "pitch": math.radians(-PITCH_DEG)}
         sizes = [{"tileSize": 256, "size": 256, "fallbackOnly": True}]
         sizes += [{"tileSize": half, "size": half}, {"tileSize": half, "size": SIDE}]
         scenes = [
-            {"id": key, "name": title, "levels": sizes, "linkHotspots": [{"target": to} for to in links.get(key, [])]}
+            {
+                "id": key,
+                "name": title,
+                "levels": sizes,
+                "linkHotspots": [{"target": to} | place for to in links.get(key, [])],
+            }
             for key, title in titles.items()
         ]
         text = f"var APP_DATA = {json.dumps({'scenes': scenes}, indent=1)};\n"
@@ -80,16 +90,19 @@ def write_configuration(
                 "title": title,
                 "type": "multires",
                 "multiRes": tiles | {"basePath": f"/{key}", "cubeResolution": SIDE},
-                "hotSpots": [{"type": "scene", "sceneId": to} for to in links.get(key, [])],
+                "hotSpots": [
+                    {"type": "scene", "sceneId": to, "yaw": YAW_DEG, "pitch": PITCH_DEG} for to in links.get(key, [])
+                ],
             }
             for key, title in titles.items()
         }
         text = json.dumps({"default": {"basePath": "./tour"}, "scenes": stated})
     else:
+        place = f"ath='{YAW_DEG}' atv='{-PITCH_DEG}'"
         text = "".join(
             f"<scene name={quoteattr(key)} title={quoteattr(title)}><image><cube url="
             f"{quoteattr(f'panos/{key}.tiles/%s/l%l/%0v/l%l_%s_%0v_%0h.png')} multires='{half},{half},{SIDE}'/></image>"
-            + "".join(f"<hotspot linkedscene={quoteattr(to.upper())}/>" for to in links.get(key, []))
+            + "".join(f"<hotspot linkedscene={quoteattr(to.upper())} {place}/>" for to in links.get(key, []))
             + "</scene>"
             for key, title in titles.items()
         )
