@@ -3,6 +3,7 @@
 from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features, GlobalDescriptor, WeakImage, WeakImages
 from pano_mvs.scene.files import Files
+from pano_mvs.scene.house import House, PlacedBy
 from pano_mvs.scene.panorama import Panorama, SceneLink
 from pano_mvs.scene.poses import Pose, Poses, WorldAxes
 from pano_mvs.scene.range_map import RangeMap
@@ -16,10 +17,12 @@ __all__ = [
     "FilePart",
     "Files",
     "GlobalDescriptor",
+    "House",
     "Pairs",
     "Panorama",
     "Part",
     "Parts",
+    "PlacedBy",
     "PointCloud",
     "Pose",
     "Poses",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -9,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.meshes import read_glb
 from pano_mvs.io.ply import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
+from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 
@@ -31,13 +33,13 @@ class SharedMesh:
     uv: NDArray[np.float32] | None = None
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8 RGB; None without a texture
 
-    def moved(self, target_from_source: Rigid3) -> SharedMesh:
+    def moved(self, target_from_source: Rigid3 | Similarity3) -> SharedMesh:
         """Return the mesh in another frame."""
         return replace(self, vertices=target_from_source.apply(self.vertices).astype(np.float32))
 
 
-def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
-    """Return the mesh of the largest group of a run in the world frame, and a note; the textured one if there are two.
+def run_mesh(run: RunOutput, group: int = 0) -> tuple[SharedMesh | None, str]:
+    """Return the mesh of a group of a run in its world frame, and a note; the textured one if there are two.
 
     Files that an earlier run left behind are not used.
 
@@ -45,11 +47,11 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
         The mesh, or None if there is none or it cannot be read; and what the reader of the page should know, or "".
     """
     notes = []
-    for name in (TEXTURED, COLORED):
+    for textured, name in ((True, group_file(TEXTURED, group)), (False, group_file(COLORED, group))):
         if not run.has_file(name):
             continue
         try:
-            mesh = _textured(run) if name == TEXTURED else _colored(run)
+            mesh = _textured(run, name, group) if textured else _colored(run, name)
         except InputError as error:
             notes.append(str(error))
             continue
@@ -98,17 +100,42 @@ def coarser(mesh: SharedMesh, max_faces: int) -> SharedMesh | None:
     return thinned(whole, max_faces)[0]
 
 
-def _colored(run: RunOutput) -> SharedMesh:
-    vertices, colors, faces = read_ply_mesh(run.out / COLORED)
+def joined_meshes(meshes: Sequence[SharedMesh]) -> SharedMesh | None:
+    """Return several meshes as one, their textures below one another; those without are left out if any has one."""
+    textured = [mesh for mesh in meshes if mesh.texture is not None and mesh.uv is not None]
+    used = textured or [mesh for mesh in meshes if mesh.colors_rgb is not None]
+    if len(used) < 2:
+        return used[0] if used else None
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in used)])
+    vertices = np.concatenate([mesh.vertices for mesh in used])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(used, first, strict=False)]).astype(np.int32)
+    if not textured:
+        colors = [mesh.colors_rgb for mesh in used if mesh.colors_rgb is not None]
+        return SharedMesh(vertices, faces, np.concatenate(colors))
+    textures = [mesh.texture for mesh in used if mesh.texture is not None]
+    width, height = max(one.shape[1] for one in textures), sum(one.shape[0] for one in textures)
+    atlas, top, places = np.zeros((height, width, 3), np.uint8), 0, []
+    for mesh, texture in zip(used, textures, strict=True):
+        assert mesh.uv is not None
+        rows, columns = texture.shape[:2]
+        atlas[top : top + rows, :columns] = texture
+        bottom = height - top - rows  # places count from the lower-left corner
+        places.append(mesh.uv * [columns / width, rows / height] + [0, bottom / height])
+        top += rows
+    return SharedMesh(vertices, faces, uv=np.concatenate(places).astype(np.float32), texture=atlas)
+
+
+def _colored(run: RunOutput, name: str) -> SharedMesh:
+    vertices, colors, faces = read_ply_mesh(run.out / name)
     return SharedMesh(vertices, faces, colors_rgb=colors)
 
 
-def _textured(run: RunOutput) -> SharedMesh:
-    arrays, texture = read_glb(run.out / TEXTURED)
+def _textured(run: RunOutput, name: str, group: int) -> SharedMesh:
+    arrays, texture = read_glb(run.out / name)
     uv = np.stack([arrays.uv[:, 0], 1 - arrays.uv[:, 1]], axis=-1)
     mesh = SharedMesh(arrays.positions, arrays.faces, uv=uv, texture=texture)
     exports = [stage for stage in run.summary.stages if stage.use == "export.mesh_textured"]
     if any(stage.params.get("frame") == "world" for stage in exports):  # instead of upright
         return mesh
-    up = world_up(split_groups(run.poses)[0]) if run.poses is not None else WORLD_UP
+    up = world_up(split_groups(run.poses)[group]) if run.poses is not None else WORLD_UP
     return replace(mesh, vertices=(mesh.vertices.astype(np.float64) @ y_up_from_world(up)).astype(np.float32))

@@ -195,15 +195,26 @@ def put_camera(
     view: RunView | None,
     image: NDArray[np.uint8] | None,
     cam_from_page: Rigid3,
+    scale: float = 1.0,
     options: ShareOptions,
 ) -> dict[str, Any]:
-    """Write the tiles, the ranges and their uncertainty of a panorama; return what the page needs to know of it."""
+    """Write the tiles, the ranges and their uncertainty of a panorama; return what the page needs to know of it.
+
+    Args:
+        page: the page.
+        idx: number of the panorama.
+        view: its ranges, if it has any.
+        image: the panorama, if it could be read.
+        cam_from_page: its pose.
+        scale: unit of its ranges in units of the page.
+        options: of the page.
+    """
     levels, tile_width = tile_layout(image.shape[1], options.max_width) if image is not None else (0, 0)
     if image is not None:
         for level, column, row, tile in panorama_tiles(image, levels, tile_width):
             page.put(f"panorama/{idx}/{level}-{column}-{row}", encode_jpeg(tile, options.jpeg_quality))
     ranges = view.range_map if view is not None else None
-    text, low, high = encode_ranges(reduced(ranges)) if ranges is not None else ("", 1.0, 2.0)
+    text, low, high = encode_ranges(reduced(ranges) * np.float32(scale)) if ranges is not None else ("", 1.0, 2.0)
     if text:
         page.put(f"panorama/{idx}/ranges", text)
     relative = view.uncertainty if view is not None and text else None

@@ -23,12 +23,11 @@ from pano_mvs.results.colors import probability_color
 from pano_mvs.results.figures import share as share_text
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
-from pano_mvs.scene import FilePart, PointCloud, Poses
+from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import decode_image
-from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 from pano_mvs.share.maps import run_plans
-from pano_mvs.share.mesh_file import run_mesh, thinned
+from pano_mvs.share.mesh_file import thinned
 from pano_mvs.share.page_folder import PageFolder
 from pano_mvs.share.scene_parts import (
     RANGES_HW,
@@ -41,6 +40,7 @@ from pano_mvs.share.scene_parts import (
     reduced,
     shown_cloud,
 )
+from pano_mvs.share.shown import Shown, ShownCamera, shown_of
 
 
 def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:
@@ -98,7 +98,8 @@ def share_run(
 ) -> Shared:
     """Write a page with the cloud, the mesh, the cameras and the panoramas of a run.
 
-    Of several groups of cameras, the largest is shown.
+    Of several groups of cameras, the largest is shown, or all with the single panoramas if links of a tour say where
+    they stand.
 
     >>> shared = share_run("out", "page")
     >>> shared.page.name, shared.panoramas
@@ -119,11 +120,10 @@ def share_run(
     run, folder, options = run if isinstance(run, RunOutput) else load(run), Path(folder), options or ShareOptions()
     images = Path(images) if images is not None else None
     rooms = given_rooms(options.rooms) if options.rooms is not None else None
-    poses = split_groups(run.poses)[0] if run.poses is not None else None
-    cloud = run.cloud.groups()[0] if run.cloud is not None else None
-    if poses is None and (cloud is None or not len(cloud)):
+    shown = shown_of(run, with_mesh=bool(options.max_triangles))
+    cloud, names = shown.cloud, tuple(camera.name for camera in shown.cameras)
+    if run.poses is None and (cloud is None or not len(cloud)):
         raise InputError(f"{run.out}: has neither a cloud nor cameras to show. Look at its report.html")
-    names = poses.names if poses is not None else ()
     if (cloud is None or not len(cloud)) and not any(_may_have_image(run, name, images) for name in names):
         raise InputError(
             f"{run.out}: there is neither a cloud nor a panorama to show. Finish the run, or give the folder of the "
@@ -132,10 +132,9 @@ def share_run(
     notes = [] if cloud is not None else ["the run has no cloud; the page shows the panoramas alone"]
     if run.summary.exit_code == INTERRUPTED:
         notes.append("the run was interrupted; the page shows what it had finished")
-    largest, *others = run.summary.poses.by_group()
-    if others:
-        notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
-    cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
+    notes += shown.notes
+    largest = run.summary.poses.by_group()[0]
+    cameras = [camera.cam_from_world for camera in shown.cameras]
     frame = page_from_world(cameras, is_level=largest.axes.is_level)
     page = PageFolder(folder)
     source = resolved(run.summary.source_folder or run.out)
@@ -143,11 +142,13 @@ def share_run(
     title = options.title or (source.parent if source.name == "images" else source).name
     scene: dict[str, Any] = {"title": title, "unit": "m" if largest.metric else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
-    geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
+    geometry, more = _put_geometry(page, run, shown, frame=frame, centers=centers, options=options)
     scene |= geometry
     notes += more
     notes += [f"--rooms: {name} matches no panorama of the page" for name in unmatched(names, rooms or {})]
-    described, sights = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
+    described, sights = _put_cameras(
+        page, run, shown.cameras, frame=frame, options=options, images=images, progress=progress
+    )
     for entry, room in zip(described, rooms_of(names, sights, rooms), strict=True):
         entry["room"] = room
     scene["cameras"] = described
@@ -171,33 +172,33 @@ def share_run(
 def _put_geometry(
     page: PageFolder,
     run: RunOutput,
-    cloud: PointCloud | None,
+    shown: Shown,
     *,
     frame: Rigid3,
     centers: NDArray[np.float64],
     options: ShareOptions,
 ) -> tuple[dict[str, Any], list[str]]:
     """Write cloud, mesh and maps; return what the page needs to know of them, and notes."""
-    shown = shown_cloud(cloud, frame, max_points=options.max_points)
-    described = put_cloud(page, shown)
-    mesh, note = run_mesh(run) if options.max_triangles else (None, "")
-    notes = [note]
+    cloud = shown_cloud(shown.cloud, frame, max_points=options.max_points)
+    described = put_cloud(page, cloud)
+    notes = []
+    mesh = shown.mesh
     described["mesh"] = None
     if mesh is not None:
         mesh, note = thinned(mesh, options.max_triangles)
         notes.append(note)
-        described["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
-    described["outline"] = outline(mesh.moved(frame).vertices if mesh is not None else shown.cloud.points_in_world)
-    plans, note = run_plans(run, frame)
+        described["mesh"] = put_mesh(page, mesh.moved(frame), cloud, jpeg_quality=options.jpeg_quality)
+    described["outline"] = outline(mesh.moved(frame).vertices if mesh is not None else cloud.cloud.points_in_world)
+    plans, note = run_plans(run, frame) if shown.has_plan else ([], "")
     notes.append(note)
-    described["maps"] = put_maps(page, shown, plans, centers=centers)
+    described["maps"] = put_maps(page, cloud, plans, centers=centers)
     return described, [note for note in notes if note]
 
 
 def _put_cameras(
     page: PageFolder,
     run: RunOutput,
-    poses: Poses | None,
+    cameras: Sequence[ShownCamera],
     *,
     frame: Rigid3,
     options: ShareOptions,
@@ -207,21 +208,26 @@ def _put_cameras(
     """Write the panoramas, and return what the page needs to know of each camera, and what cameras see by name."""
     described: list[dict[str, Any]] = []
     sights = {}
-    for idx, name in enumerate(poses.names if poses is not None else ()):
-        assert poses is not None
-        view = run.views.get(name)
+    number = {camera.name: idx for idx, camera in enumerate(cameras)}
+    for idx, one in enumerate(cameras):
+        name = one.name
+        view = run.views.get(name) if one.scale is not None else None
         image = _image(run, name, images, max_width=options.max_width)
-        pose = poses.cam_from_world(idx) @ frame.inverse()
+        pose = one.cam_from_world @ frame.inverse()
         probability = run.summary.poses.p_right.get(name)
         judged = (
             {} if probability is None else {"right": share_text(probability), "color": probability_color(probability)}
         )
-        camera = put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)
-        described.append({"name": name, **judged, **camera})
+        scale = 1.0 if one.scale is None else one.scale
+        camera = put_camera(page, idx, view=view, image=image, cam_from_page=pose, scale=scale, options=options)
+        placed: dict[str, Any] = {"placed": one.placed} if one.placed else {}
+        if one.leads_to is not None and camera["ranges"] is None:
+            placed["leadsTo"] = [number[target] for target in one.leads_to if target in number]
+        described.append({"name": name, **judged, **placed, **camera})
         if view is not None and view.range_map is not None:
-            sights[name] = Sight(pose, reduced(view.range_map))
+            sights[name] = Sight(pose, reduced(view.range_map) * np.float32(scale))
         if progress is not None:
-            progress(idx + 1, len(poses.names))
+            progress(idx + 1, len(cameras))
     return described, sights
 
 

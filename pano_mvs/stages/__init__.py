@@ -33,6 +33,7 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
+from pano_mvs.stages.house import house_file, links
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge
 from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad

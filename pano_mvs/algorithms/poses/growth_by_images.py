@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.growth import grown_model, settle, why_nothing
-from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
+from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry, PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
+from pano_mvs.algorithms.poses.placement.places import Placement
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups
-from pano_mvs.algorithms.poses.verification.arrangements import CHANCE_SHARE, is_better_arrangement
+from pano_mvs.algorithms.poses.verification.appearance import Appearance, Surroundings
+from pano_mvs.algorithms.poses.verification.arrangements import CHANCE_SHARE, is_better_arrangement, place_score
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_from_ray
 
 Seed = tuple[Edge, int]
@@ -24,6 +29,7 @@ repeat), in less than half the time."""
 _SEEDS, _MANY = 4, 20
 _PARTNERS = 4  # of each image, with most matches; the geometries of its pairs with them may be seeds
 _IMAGES, _PLACES = 8, 8  # numbers of images, and of places of each, that are compared before one is added
+_SWEPT = 3  # number of places of an image that are swept, those where it shows most of what is expected
 _STEPS = 1, 2  # in the order of capture, between images of pairs from which a model grows
 
 
@@ -57,8 +63,8 @@ def model_by_images(
 
     Several models are compared, of which the one whose cameras are confirmed most is returned: one by the pairs alone
     (`grown_model`), those that begin with pairs of neighbours in the order of capture, and those that begin with a seed
-    that both of its images confirm. In larger groups, seeds are used if neighbours gain nothing, and the first one that
-    gains nothing is the last one.
+    that both of its images confirm. An arrangement that is the best one when it is found for the second time ends the
+    search. In larger groups, seeds are used if neighbours gain nothing, and the first one that gains nothing ends it.
 
     Args:
         pairs: all pairs of the capture.
@@ -68,24 +74,34 @@ def model_by_images(
     """
     small = confirmation.at_width(_WIDTH_PX)
     best = by_pairs = grown_model(pairs, images, adjust=adjust)
+    best_of_seed = False
+    many = len(images) > _MANY
+    for model in _starts(pairs, images, small, adjust=adjust):
+        of_seed = len(model.cameras) == 2
+        if many and of_seed and best is not by_pairs:
+            break
+        found = _completed(model, images, small, adjust=adjust)
+        if of_seed and best_of_seed and found[0].is_same_arrangement(best[0]):
+            break
+        if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
+            best, best_of_seed = found, of_seed
+        elif many and of_seed:
+            break
+    return best
+
+
+def _starts(
+    pairs: Pairs, images: Collection[int], confirmation: Confirmation, *, adjust: bool
+) -> Iterator[PlacedModel]:
+    """Yield the models from which to grow: those of neighbours in the order of capture, then seeds."""
     for steps in _STEPS:
         model = _of_neighbours(pairs, images, steps, adjust=adjust)
         if model is not None:
-            found = _completed(model, images, small, adjust=adjust)
-            if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
-                best = found
-    many = len(images) > _MANY
-    if many and best is not by_pairs:
-        return best
-    for seed in _seeds(pairs, images, small):
+            yield model
+    for seed in _seeds(pairs, images, confirmation):
         model = PlacedModel(pairs)
         model.seed(*seed)
-        found = _completed(model, images, small, adjust=adjust)
-        if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
-            best = found
-        elif many:
-            break
-    return best
+        yield model
 
 
 def _seeds(pairs: Pairs, images: Collection[int], confirmation: Confirmation) -> list[Seed]:
@@ -158,11 +174,15 @@ def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmat
     adjusted = len(model.cameras)
     options: list[_Option] = []
     changed = set(model.cameras)
+    maps: dict[int, NDArray[np.float32]] = {}
     while True:
-        _learn_ranges(model, changed, confirmation)
-        options = _options(model, left, confirmation, known=options)
-        best = max(options, key=lambda option: (option.share, -option.image), default=None)
-        if best is None or best.share < CHANCE_SHARE:
+        for camera in sorted(changed):
+            maps[camera] = confirmation.ranges(camera, model.cameras)
+            model.confirmed_ranges[camera] = ranges_of_key_points(maps[camera], model.pairs.bearings[camera])
+        options = _options(model, left, confirmation, maps, known=options)
+        usable = [option for option in options if option.share >= CHANCE_SHARE]
+        best = max(usable, key=lambda option: (option.score, -option.image), default=None)
+        if best is None:
             break
         model.add(best.image, best.pose)
         left.discard(best.image)
@@ -176,13 +196,10 @@ def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmat
     return dict.fromkeys(refused, "at the places that its pairs suggest, other images confirm nothing of what it sees")
 
 
-def _learn_ranges(model: PlacedModel, cameras: Collection[int], confirmation: Confirmation) -> None:
-    """Compute the ranges of the key points of some cameras again that the images confirm."""
-    for camera in sorted(cameras):
-        ranges = confirmation.ranges(camera, model.cameras)
-        pixels_px = pixel_from_ray(model.pairs.bearings[camera], ranges.shape)
-        columns, rows = np.floor(pixels_px).astype(np.intp).T
-        model.confirmed_ranges[camera] = ranges[rows.clip(0, len(ranges) - 1), columns % ranges.shape[1]]
+def ranges_of_key_points(ranges: NDArray[np.float32], bearings: FloatArray) -> FloatArray:
+    """Return the ranges of key points (N,) in a small map, NaN where it has none."""
+    columns, rows = np.floor(pixel_from_ray(bearings, ranges.shape)).astype(np.intp).T
+    return np.asarray(ranges[rows.clip(0, len(ranges) - 1), columns % ranges.shape[1]], np.float64)
 
 
 def _nearest(model: PlacedModel, camera: int) -> list[int]:
@@ -196,24 +213,39 @@ class _Option:
 
     image: int
     suggested: Rigid3  # the pose on which pairs agree
-    pose: Rigid3  # refined on known points
     sources: list[int]  # the nearest cameras
-    share: float  # of what the image sees there, confirmed by these
+    appearance: Appearance  # of the image there
+    pose: Rigid3  # refined on known points, as soon as it is swept
+    share: float = -1.0  # of what the image sees there, confirmed by these; negative if it was not swept
+
+    @property
+    def score(self) -> float:
+        """How far what the image shows is for this place, to be compared with that of other places alone."""
+        return place_score(max(self.share, 0.0), self.appearance)
 
 
 def _options(
-    model: PlacedModel, images: Collection[int], confirmation: Confirmation, *, known: list[_Option]
+    model: PlacedModel,
+    images: Collection[int],
+    confirmation: Confirmation,
+    maps: Mapping[int, NDArray[np.float32]],
+    *,
+    known: list[_Option],
 ) -> list[_Option]:
     """Return the places of the images that are connected best with a model; of the next ones if these have none.
+
+    Those at which the images show most of what other cameras expect are swept.
 
     Args:
         model: the model.
         images: images that are not in it.
         confirmation: of the capture.
+        maps: confirmed ranges of its cameras.
         known: places that were compared before.
     """
+    surroundings = Surroundings(confirmation, model.cameras, maps)
 
-    def places(image: int) -> Iterator[_Option]:
+    def places(image: int) -> Iterator[tuple[_Option, Callable[[], Rigid3]]]:
         evidence, found = model.place(image, most=_PLACES)
         for place in found:
             pose = place.cam_from_world
@@ -227,21 +259,28 @@ def _options(
                 and np.linalg.norm(option.suggested.center - pose.center) < 0.03 * nearest
                 and geodesic_angle(option.suggested.rotation, pose.rotation) < np.deg2rad(1.0)
             )
-            option = next(before, None)
-            if option is None:
-                refined, _, _ = model.polished(image, evidence, place)
-                share = confirmation.share(image, refined, model.cameras)
-                option = _Option(image, pose, refined, sources, float(np.nan_to_num(share)))
-            yield option
+            option = next(before, None) or _Option(image, pose, sources, surroundings.appearance(image, pose), pose)
+            yield option, partial(_refined, model, image, evidence, place)
 
     weights = {image: _connection(model, image) for image in images}
     connected = sorted((image for image in images if weights[image] > 0), key=lambda idx: (-weights[idx], idx))
-    found: list[_Option] = []
+    compared: list[_Option] = []
     for first in range(0, len(connected), _IMAGES):
-        found += (option for image in connected[first : first + _IMAGES] for option in places(image))
-        if any(option.share >= CHANCE_SHARE for option in found):
+        for image in connected[first : first + _IMAGES]:
+            found = sorted(places(image), key=lambda each: -place_score(0.0, each[0].appearance))
+            for number, (option, refined) in enumerate(found):
+                if number < _SWEPT and option.share < 0:
+                    pose = refined()
+                    share = float(np.nan_to_num(confirmation.share(option.image, pose, model.cameras)))
+                    option = replace(option, pose=pose, share=share)
+                compared.append(option)
+        if any(option.share >= CHANCE_SHARE for option in compared):
             break
-    return found
+    return compared
+
+
+def _refined(model: PlacedModel, image: int, evidence: PairEvidence, place: Placement) -> Rigid3:
+    return model.polished(image, evidence, place)[0]
 
 
 def _connection(model: PlacedModel, image: int) -> float:

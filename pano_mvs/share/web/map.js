@@ -15,8 +15,9 @@ class PlanMap {
       const button = document.createElement("button");
       button.type = "button";
       button.tabIndex = -1;
-      const { title, right, color } = panorama.camera; // the probability that the pose is right, if it is known
-      button.ariaLabel = button.title = right ? `${title} · pose right with a probability of ${right}` : title;
+      const { title, right, color, placed } = panorama.camera; // the probability that the pose is right, if it is known
+      button.ariaLabel = button.title = placed ? `${title} · ${placed}` : right ? `${title} · pose right with a probability of ${right}` : title;
+      button.classList.toggle("rough", Boolean(placed));
       if (color) button.style.setProperty("--judged", color);
       button.disabled = !panorama.camera.levels;
       button.addEventListener("click", () => visit(panorama));

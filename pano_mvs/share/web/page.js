@@ -280,6 +280,8 @@ class Page {
       if (this.mode !== "inside" || !this.here) continue;
       const there = panorama.center.clone().sub(this.here.center);
       const seen = this.here.pick(there);
+      const leads = this.here.camera.leadsTo; // without ranges, what walls hide is not known
+      if (leads && !leads.includes(index)) { ring.visible = false; continue; }
       ring.visible = panorama !== this.here && panorama.camera.levels > 0 && (!seen || seen.point.distanceTo(this.here.center) > 0.85 * there.length());
     }
   }

@@ -39,6 +39,7 @@ SIDES = 4
 # Search around the given up direction: half width, step and tolerance in degrees.
 _ROUNDS = ((20.0, 2.0, 3.0), (2.0, 0.5, 1.0), (0.5, 0.1, 0.5))
 _MIN_SEGMENTS = 20
+_CLEAR_WALLS = 1.5  # support of the directions of walls, relative to the median over all level directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +160,31 @@ def orthogonal_directions(segments: Segments) -> FloatArray | None:
     along = np.cross(first.up, across)
     best = int(np.argmax(sum(_support(segments, each, tolerance_deg) for each in (across, along))))
     return np.array([first.up, across[best], along[best]])
+
+
+def wall_azimuth(segments: Segments) -> float:
+    """Return the azimuth of walls at right angles, from z towards x, in [0, π/2); NaN if none is clear.
+
+    Args:
+        segments: of all directions in a level world, whose y points down; see `find_segments`.
+    """
+    # A vertical edge also lies on a great circle through the level direction in which it is seen.
+    level = np.abs(segments.normals @ UP) > np.sin(np.deg2rad(3.0))
+    kept = Segments(segments.normals[level], segments.weights[level], segments.groups[level])
+    if len(kept.weights) < _MIN_SEGMENTS:
+        return float("nan")
+
+    def support(azimuths_deg: FloatArray, tolerance_deg: float) -> FloatArray:
+        angles = np.deg2rad(azimuths_deg + np.array([[0.0], [90.0]]))
+        directions = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
+        return sum((_support(kept, each, tolerance_deg) for each in directions), np.zeros(len(azimuths_deg)))
+
+    coarse = np.arange(0.0, 90.0)
+    found = support(coarse, _ROUNDS[0][2])
+    if found.max() < _CLEAR_WALLS * np.median(found):
+        return float("nan")
+    fine = coarse[int(np.argmax(found))] + np.arange(-2.0, 2.01, 0.1)
+    return float(np.deg2rad(fine[int(np.argmax(support(fine, _ROUNDS[1][2])))]) % (np.pi / 2))
 
 
 def directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:

@@ -50,7 +50,8 @@ def height_above_floor(model: PlacedModel) -> float:
         ranges = model.known_ranges(image)
         known = np.isfinite(ranges)
         points.append(camera.center + ranges[known, None] * (model.pairs.bearings[image][known] @ camera.rotation))
-    return _height(np.concatenate(points), list(model.cameras.values()), [_up(model, image) for image in model.cameras])
+    ups = [_up(model, image) for image in model.cameras]
+    return height_over_points(np.concatenate(points), list(model.cameras.values()), ups)
 
 
 def length_by_floor(
@@ -73,7 +74,7 @@ def length_by_floor(
     ranges, others = ranges_from_bearings(*rays, second_from_first)
     known = (ranges > 0) & (others > 0)
     cameras = [Rigid3.identity(), second_from_first]
-    own = _height(ranges[known, None] * rays[0][known], cameras, [_up(model, image) for image in pair])
+    own = height_over_points(ranges[known, None] * rays[0][known], cameras, [_up(model, image) for image in pair])
     return height / own if own else np.nan
 
 
@@ -81,7 +82,8 @@ def _up(model: PlacedModel, image: int) -> FloatArray:
     return np.array(model.pairs.features[model.pairs.names[image]].ups[0])
 
 
-def _height(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[FloatArray]) -> float:
+def height_over_points(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[FloatArray]) -> float:
+    """Return the height of upright cameras above the floor among points (P, 3); 0 if it is not known."""
     ups = np.array([camera.rotation.T @ up for camera, up in zip(cameras, ups_in_cam, strict=True)])
     up = ups.mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)

@@ -191,6 +191,12 @@ class PlacedModel:
             and angle_between(view.direction, relative.translation) < float(np.deg2rad(10.0))
         )
 
+    def is_same_arrangement(self, other: PlacedModel) -> bool:
+        """Return whether another model of the same pairs has the same images, and they are arranged alike."""
+        return self.cameras.keys() == other.cameras.keys() and all(
+            other.agrees_with(edge, self.pairs.geometries[edge][rank].view) for edge, rank in self.chosen.items()
+        )
+
     def with_cameras(self, cameras: Mapping[int, Rigid3]) -> PlacedModel:
         """Return a model of the same pairs with other cameras, whose geometries and ranges depend on these alone."""
         model = PlacedModel(self.pairs, dict(cameras))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pano_mvs.algorithms.poses.verification.appearance import Appearance
 from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, Confirmation, Evidence
 from pano_mvs.geometry import Rigid3
 
@@ -15,6 +16,23 @@ SHARE_STD = 0.02
 CHANCE_SHARE = 0.08
 """What others confirm of a camera in a wrong place: .036 in the median and .073 at most, of 80 in 25 drawn captures; of
 124 right cameras, .085 at least. Measured at 256 columns."""
+
+_PLACE_WEIGHTS = {"share": 7.0, "agreement": 3.4, "correlation": 2.1, "cover": -2.0}
+"""Of 131 blocks of true cameras in 60 drawn captures, the best place is right for 80 % by the share, for 84 % by these
+weights, and for 91 % by those of most likelihood there: 3.6, 3.4, 2.1 and -3.9. But models do not grow from true blocks
+alone: of 94 cameras of six large captures that repeat, the latter place 54 rightly, the share 61, and these weights,
+which are between both, 65."""
+
+
+def place_score(share: float, appearance: Appearance) -> float:
+    """Return how far what an image shows is for a place, to be compared with that of other places alone.
+
+    Args:
+        share: of what it sees there, confirmed by its nearest cameras; 0 if this was not measured.
+        appearance: of the image there. The more cameras expect of it, the less agreement says.
+    """
+    measured: dict[str, float] = {"share": share, **appearance._asdict()}
+    return sum(weight * measured[name] for name, weight in _PLACE_WEIGHTS.items())
 
 
 def is_better_arrangement(

@@ -1,0 +1,1 @@
+"""Put the groups of cameras and the single panoramas of a capture into one house."""

@@ -1,0 +1,163 @@
+"""Put the groups of cameras and the single panoramas of a tour into one house, by its links."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pano_mvs.algorithms.house.layout import Place, layout
+from pano_mvs.algorithms.house.parts import Part, part_links
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, wall_azimuth
+from pano_mvs.algorithms.poses.joining.floors import height_over_points
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import UP, Rigid3, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.scene import House, PlacedBy, Poses, SceneLink
+from pano_mvs.scene.pose_groups import split_groups, with_cameras
+from pano_mvs.scene.upright import mean_up_direction
+
+_SHARED_POINTS = 15  # least number of points that two cameras of one part see
+_BESIDE = 3.0  # distance of what no link joins from the house, in camera heights
+
+
+@dataclass(frozen=True, eq=False)
+class _Levelled:
+    """A part, with the rotation from the world of its group into its level frame."""
+
+    part: Part
+    level_from_world: Rigid3
+    height_of_cameras: float  # y of the cameras in the level frame
+    group: int  # number of the group; -1 for a single panorama
+
+
+def house_of_links(
+    poses: Poses,
+    links: Mapping[str, Sequence[SceneLink]],
+    pictures: Mapping[str, Picture],
+    *,
+    up_in_cam: Mapping[str, Sequence[float]] | None = None,
+) -> House:
+    """Return where all panoramas of a tour stand, in the frame and unit of the largest group of cameras.
+
+    Cameras of a tour stand at one height above the floor, so that groups and single panoramas have one unit. Links
+    give directions and rough distances (see `layout`), and the lines of walls the exact turn around the vertical. All
+    floors are put at one level: links say nothing about storeys.
+
+    Doubtful cameras stand where links say, not where matches do, and cameras that only these connect with a group do
+    not belong to it: what makes them doubtful is that rooms look alike, and then links know better.
+
+    Args:
+        poses: of the panoramas that are in groups; others are single.
+        links: image name to its links. With less than one between two parts, no picture is loaded.
+        pictures: image name to a function that loads it, of all panoramas in the capture's order.
+        up_in_cam: direction away from gravity by sensors of cameras; others are taken to be level.
+    """
+    ups = up_in_cam or {}
+    groups = split_groups(poses) if poses.names else []
+    levelled = [
+        _of_group(with_cameras(group, np.isin(group.names, names)), number)
+        for number, group in enumerate(groups)
+        for names in _certain(group)
+    ]
+    levelled.sort(key=lambda one: -len(one.part.cameras))
+    grouped = {name for one in levelled for name in one.part.cameras}
+    for name in pictures:
+        if name not in grouped:
+            level = Rigid3(rotation_from_two_vectors(np.asarray(ups.get(name, UP), np.float64), UP), np.zeros(3))
+            levelled.append(_Levelled(Part({name: level.inverse()}), Rigid3.identity(), 0.0, -1))
+    parts = [one.part for one in levelled]
+    if len({number for link in part_links(parts, links) for number in link.parts}) > 1:
+        parts = [_with_walls(part, pictures) for part in parts]
+    places = layout(parts, part_links(parts, links), rng=np.random.default_rng(0))
+    return _house(levelled, places, links, order=tuple(pictures))
+
+
+def _certain(group: Poses) -> list[list[str]]:
+    """Return the cameras of a group that are not doubtful and share points, in parts of two or more, largest first."""
+    seen = coo_array(
+        (np.ones(len(group.track_image_idx)), (group.track_image_idx, group.track_point_idx)),
+        (len(group.names), len(group.points_in_world)),
+    ).tocsr()
+    certain = np.array([name not in group.doubts for name in group.names], np.bool_)
+    shared = (seen @ seen.T).toarray() >= (_SHARED_POINTS if len(group.points_in_world) else 0)
+    labels = connected_components(shared & certain & certain[:, None], directed=False)[1]
+    parts = [np.flatnonzero(certain & (labels == label)) for label in np.unique(labels[certain])]
+    parts.sort(key=lambda part: (-len(part), int(part[0])))
+    return [[group.names[idx] for idx in part] for part in parts if len(part) > 1]
+
+
+def _of_group(group: Poses, number: int) -> _Levelled:
+    cameras = list(group.cameras.values())
+    up = None if group.worlds[0].axes.is_level else mean_up_direction([camera.rotation for camera in cameras])
+    level = Rigid3(np.eye(3) if up is None else rotation_from_two_vectors(up, UP), np.zeros(3))
+    own = {name: camera @ level.inverse() for name, camera in group.cameras.items()}
+    ups = [camera.rotation @ UP for camera in own.values()]
+    height = height_over_points(level.apply(group.points_in_world), list(own.values()), ups)
+    return _Levelled(
+        Part(own, height=height or np.nan),
+        level,
+        float(np.median([camera.center[1] for camera in own.values()])),
+        number,
+    )
+
+
+def _with_walls(part: Part, pictures: Mapping[str, Picture]) -> Part:
+    rotations = {name: camera.rotation for name, camera in part.cameras.items()}
+    return Part(part.cameras, part.height, wall_azimuth(find_segments(pictures, rotations)))
+
+
+def _house(
+    levelled: Sequence[_Levelled],
+    places: Sequence[Place | None],
+    links: Mapping[str, Sequence[SceneLink]],
+    *,
+    order: Sequence[str],
+) -> House:
+    """Return the house in which parts stand at their places; those without a place stand beside it."""
+    first = places[0]
+    assert first is not None
+    world_from_level = levelled[0].level_from_world.inverse()
+    rows: dict[str, tuple[Rigid3, int, float, PlacedBy, float, float]] = {}
+    right = max(_reach(one.part, place) for one, place in zip(levelled, places, strict=True) if place is not None)
+    for number, (one, place) in enumerate(zip(levelled, places, strict=True)):
+        by = PlacedBy.LINKS if number or one.part.is_single else PlacedBy.MATCHES
+        if place is None:
+            scale = 1.0 if one.part.is_single else 1 / one.part.height if np.isfinite(one.part.height) else first.scale
+            beside = Place(np.zeros(2), 0.0, scale, np.inf, np.inf)
+            left = -_reach(one.part, beside, sign=-1)
+            place = Place(np.array([right + _BESIDE + left, 0.0]), 0.0, scale, np.inf, np.inf)
+            right, by = _reach(one.part, place), PlacedBy.NOTHING
+        scale = place.scale / first.scale
+        x, z = place.position / first.scale
+        height = levelled[0].height_of_cameras - scale * one.height_of_cameras
+        level_from_part = Similarity3(scale, rotation_from_rotvec((0.0, place.turn_rad, 0.0)), np.array([x, height, z]))
+        house_from_part = Similarity3(1.0, world_from_level.rotation, np.zeros(3)) @ level_from_part
+        for name, camera in one.part.cameras.items():
+            pose = house_from_part.move_camera(camera)
+            rows[name] = (pose, one.group, scale, by, place.position_std / first.scale, place.turn_std_rad)
+    names = tuple(name for name in order if name in rows)
+    columns = [*zip(*(rows[name] for name in names), strict=True)]
+    height = levelled[0].part.height
+    return House(
+        names=names,
+        rotations=np.array([pose.rotation for pose in columns[0]]),
+        translations=np.array([pose.translation for pose in columns[0]]),
+        groups=np.array(columns[1], np.int32),
+        scales=np.array([scale if group >= 0 else 1.0 for group, scale in zip(columns[1], columns[2], strict=True)]),
+        placed_by=tuple(str(by) for by in columns[3]),
+        center_stds=np.array(columns[4], np.float64),
+        turn_stds_rad=np.array(columns[5], np.float64),
+        links=tuple(tuple(link.name for link in links.get(name, ()) if link.name in rows) for name in names),
+        camera_height=float(height) if np.isfinite(height) else float(1 / first.scale) if len(places) > 1 else None,
+    )
+
+
+def _reach(part: Part, place: Place, *, sign: int = 1) -> float:
+    """Return the largest x of the cameras of a part at a place, or its smallest one, in camera heights."""
+    sine, cosine = np.sin(place.turn_rad), np.cos(place.turn_rad)
+    centers: FloatArray = np.array([camera.center for camera in part.cameras.values()])
+    along = place.scale * (cosine * centers[:, 0] + sine * centers[:, 2]) + place.position[0]
+    return float(along.max() if sign > 0 else along.min())

@@ -1,0 +1,62 @@
+"""house.json says where panoramas stand, and is read as it was written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.house_file import house_document, read_house
+from pano_mvs.scene import House
+
+
+def house() -> House:
+    return House(
+        names=("a", "b"),
+        rotations=np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]),
+        translations=np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]),
+        groups=np.array([0, -1], np.int32),
+        scales=np.array([1.0, 1.0]),
+        placed_by=("matches", "links"),
+        center_stds=np.array([0.0, np.inf]),
+        turn_stds_rad=np.array([0.0, 0.1]),
+        links=(("b",), ()),
+        camera_height=1.5,
+    )
+
+
+def test_a_house_is_read_as_it_was_written(tmp_path: Path) -> None:
+    file = tmp_path / "house.json"
+    file.write_text(json.dumps(house_document(house())))
+    again = read_house(file)
+    assert again.names == ("a", "b")
+    assert again.placed_by == ("matches", "links")
+    assert again.groups.tolist() == [0, -1]
+    assert again.camera_height == 1.5
+    assert again.links == (("b",), ())
+    assert np.allclose(again.rotations, house().rotations)
+    assert np.allclose(again.translations, house().translations)
+    assert again.center_stds.tolist() == [0.0, np.inf]
+    assert np.allclose(again.turn_stds_rad, [0.0, 0.1])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"panoramas": [{}], "camera_height": null}', '{"panoramas": 3, "camera_height": null}']
+)
+def test_another_file_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "house.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"house\.json"):
+        read_house(file)
+
+
+def test_a_place_by_an_unknown_source_is_refused(tmp_path: Path) -> None:
+    document = house_document(house())
+    document["panoramas"][0]["placed_by"] = "magic"
+    file = tmp_path / "house.json"
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="placed_by"):
+        read_house(file)
