@@ -27,6 +27,7 @@ KINDS = {
     "pairs": "select the pairs of images to match",
     "matches": "match key points and estimate the geometry of two views",
     "poses": "estimate, verify, refine and transform poses",
+    "house": "put all panoramas of a tour into one house",
     "views": "select the sources of each reference",
     "depth": "compute the range of every pixel of a reference",
     "filters": "improve range maps",
