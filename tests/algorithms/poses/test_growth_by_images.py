@@ -15,6 +15,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel,
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
+from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.testing.room import default_room, range_along
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
@@ -55,6 +56,18 @@ def test_the_images_place_a_camera_that_most_matches_put_elsewhere() -> None:
     assert len(by_images.cameras) == len(POSES)
     assert not misplaced(by_images)
     assert not refused
+
+
+def test_two_models_are_one_arrangement_whatever_their_frames_and_units_are() -> None:
+    features, views = room_matches({})
+    model = grown_model(pairs_of(features, views), ALL, adjust=True)[0]
+    into_other = Similarity3(3.0, rotation_from_rotvec((0.1, 0.7, -0.2)), np.array([1.0, 2.0, 3.0]))
+    other = model.with_cameras({image: into_other.move_camera(pose) for image, pose in model.cameras.items()})
+    assert model.is_same_arrangement(other)
+    moved = {**model.cameras, 4: Rigid3.from_center(model.cameras[4].rotation, model.cameras[4].center + 0.5)}
+    assert not model.is_same_arrangement(model.with_cameras(moved))
+    fewer = {image: pose for image, pose in model.cameras.items() if image != 4}
+    assert not model.is_same_arrangement(model.with_cameras(fewer))
 
 
 def pairs_without_common_points() -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
