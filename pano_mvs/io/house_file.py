@@ -3,14 +3,15 @@
     {
       "camera_height": 1.25,
       "panoramas": [
-        {"name": "Kitchen.png", "placed_by": "links", "group": null, "scale": 1.0, "center": [5.4, 0.0, -0.9],
-         "rotation": [[…], […], […]], "center_std": 1.6, "turn_std_deg": 2.0, "links": ["Hallway.png"]},
+        {"name": "Kitchen.png", "placed_by": "links", "part": 3, "group": null, "scale": 1.0,
+         "center": [5.4, 0.0, -0.9], "rotation": [[…], […], […]], "center_std": 1.6, "turn_std_deg": 2.0,
+         "links": ["Hallway.png"]},
         …
       ]
     }
 
-The frame and the unit are those of the largest group of cameras. `rotation` is that of cam_from_house; `scale` is the
-unit of the group's world in units of the house. A deviation that is not known is null.
+The frame and the unit are those of the group of part 0, the largest. `rotation` is that of cam_from_house; `scale` is
+the unit of the group's world in units of the house. A deviation that is not known is null.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ def house_document(house: House) -> dict[str, Any]:
             {
                 "name": name,
                 "placed_by": house.placed_by[idx],
+                "part": int(house.parts[idx]),
                 "group": int(house.groups[idx]) if house.groups[idx] >= 0 else None,
                 "scale": float(house.scales[idx]),
                 "center": house.cam_from_house(idx).center.tolist(),
@@ -67,6 +69,7 @@ def read_house(path: Path) -> House:
             names=tuple(str(row["name"]) for row in rows),
             rotations=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
             translations=np.array([pose.translation for pose in poses]).reshape(-1, 3),
+            parts=np.array([row["part"] for row in rows], np.int32),
             groups=np.array([-1 if row["group"] is None else row["group"] for row in rows], np.int32),
             scales=np.array([row["scale"] for row in rows], np.float64),
             placed_by=tuple(str(row["placed_by"]) for row in rows),

@@ -36,6 +36,7 @@ class House(Record):
         names: (N) names of the images, in the capture's order.
         rotations: (N, 3, 3) float64 of cam_from_house.
         translations: (N, 3) float64 of cam_from_house, units of the house.
+        parts: (N,) int32 the part of each image; 0 is the largest.
         groups: (N,) int32 the group of each image in `Poses`; -1 for a single panorama.
         scales: (N,) float64 the unit of the group's world in units of the house; 1 for a single panorama.
         placed_by: (N) what says where it stands, one of `PlacedBy`.
@@ -51,6 +52,7 @@ class House(Record):
     names: tuple[str, ...]
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
+    parts: NDArray[np.int32]
     groups: NDArray[np.int32]
     scales: NDArray[np.float64]
     placed_by: tuple[str, ...]
@@ -78,6 +80,7 @@ class House(Record):
         require({*self.placed_by} <= {*map(str, PlacedBy)}, self, "placed_by has an unknown value")
         require_array(self, "rotations", dtype=np.float64, shape=(images, 3, 3))
         require_array(self, "translations", dtype=np.float64, shape=(images, 3))
+        require_array(self, "parts", dtype=np.int32, shape=(images,))
         require_array(self, "groups", dtype=np.int32, shape=(images,))
         scales = require_array(self, "scales", dtype=np.float64, shape=(images,))
         require(bool((scales > 0).all()), self, "a scale is not positive")

@@ -117,6 +117,10 @@ class Panorama(Record):
     second_lens: FilePart | None = None
     links: tuple[SceneLink, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Convert links that are given by their names, or stored as lists."""
+        object.__setattr__(self, "links", tuple(map(SceneLink.from_value, self.links)))
+
     def to_parts(self) -> Parts:
         """Return the panorama with its rig as JSON; nothing is stored about a rig or links that it does not have."""
         parts = dict(super().to_parts())
@@ -133,8 +137,7 @@ class Panorama(Record):
         meta = parts["meta"]
         assert isinstance(meta, dict)
         rig = meta.get("rig")
-        links = tuple(SceneLink.from_value(link) for link in panorama.links)
-        return replace(panorama, links=links, rig=None if rig is None else LensRig.from_values(rig))
+        return panorama if rig is None else replace(panorama, rig=LensRig.from_values(rig))
 
     def check(self) -> None:
         """Raise ContractError unless the sizes are those of full spheres."""

@@ -129,18 +129,17 @@ def share_run(
             f"{run.out}: there is neither a cloud nor a panorama to show. Finish the run, or give the folder of the "
             "panoramas with --images DIR"
         )
-    notes = [] if cloud is not None else ["the run has no cloud; the page shows the panoramas alone"]
+    notes = [] if run.cloud is not None else ["the run has no cloud; the page shows the panoramas alone"]
     if run.summary.exit_code == INTERRUPTED:
         notes.append("the run was interrupted; the page shows what it had finished")
     notes += shown.notes
-    largest = run.summary.poses.by_group()[0]
     cameras = [camera.cam_from_world for camera in shown.cameras]
-    frame = page_from_world(cameras, is_level=largest.axes.is_level)
+    frame = page_from_world(cameras, is_level=shown.is_level)
     page = PageFolder(folder)
     source = resolved(run.summary.source_folder or run.out)
     # The name of the folder of the capture, which may hold its images in `images`; else of the output.
     title = options.title or (source.parent if source.name == "images" else source).name
-    scene: dict[str, Any] = {"title": title, "unit": "m" if largest.metric else "units", "ranges": list(RANGES_HW)}
+    scene: dict[str, Any] = {"title": title, "unit": "m" if shown.metric else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
     geometry, more = _put_geometry(page, run, shown, frame=frame, centers=centers, options=options)
     scene |= geometry
@@ -221,7 +220,7 @@ def _put_cameras(
         scale = 1.0 if one.scale is None else one.scale
         camera = put_camera(page, idx, view=view, image=image, cam_from_page=pose, scale=scale, options=options)
         placed: dict[str, Any] = {"placed": one.placed} if one.placed else {}
-        if one.leads_to is not None and camera["ranges"] is None:
+        if one.leads_to is not None:
             placed["leadsTo"] = [number[target] for target in one.leads_to if target in number]
         described.append({"name": name, **judged, **placed, **camera})
         if view is not None and view.range_map is not None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.house_file import HOUSE_FILE, read_house
 from pano_mvs.results.run_output import RunOutput
-from pano_mvs.scene import House, PlacedBy, PointCloud
+from pano_mvs.scene import House, PlacedBy, PointCloud, Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.share.mesh_file import SharedMesh, joined_meshes, run_mesh
 
@@ -29,7 +32,7 @@ class ShownCamera:
     cam_from_world: Rigid3
     scale: float | None = 1.0  # unit of its ranges; None if these do not fit the place where it is shown
     placed: str = ""  # what says where it is, unless matches do
-    leads_to: tuple[str, ...] | None = None  # panoramas that can be seen from it, if it has no ranges
+    leads_to: tuple[str, ...] | None = None  # panoramas to which links of a tour lead; None if it is no tour
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,8 @@ class Shown:
     cameras: tuple[ShownCamera, ...]
     cloud: PointCloud | None
     mesh: SharedMesh | None
+    metric: bool = False  # whether the unit is the metre
+    is_level: bool = False  # whether y points down along gravity
     has_plan: bool = True  # whether floor plans of the largest group show all of it
     notes: tuple[str, ...] = ()
 
@@ -49,7 +54,8 @@ def shown_of(run: RunOutput, *, with_mesh: bool) -> Shown:
     if house is not None:
         return _whole_house(run, house, with_mesh=with_mesh)
     notes = [note]
-    if len(run.summary.poses.by_group()) > 1:
+    largest, *others = run.summary.poses.by_group()
+    if others:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     mesh, note = run_mesh(run) if with_mesh else (None, "")
     poses = split_groups(run.poses)[0] if run.poses is not None else None
@@ -58,6 +64,8 @@ def shown_of(run: RunOutput, *, with_mesh: bool) -> Shown:
         tuple(ShownCamera(name, pose) for name, pose in cameras.items()),
         run.cloud.groups()[0] if run.cloud is not None else None,
         mesh,
+        metric=largest.metric,
+        is_level=largest.axes.is_level,
         notes=tuple(filter(None, (*notes, note))),
     )
 
@@ -76,19 +84,29 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
     clouds = run.cloud.groups() if run.cloud is not None else []
     shown_clouds, meshes, notes = list[PointCloud](), list[SharedMesh](), list[str]()
     for number, group in enumerate(groups):
-        inside = [name for name, own in zip(house.names, house.groups, strict=True) if own == number]
-        if not inside:
+        moves = _moves(group, house, number)
+        if not any(moves):
             continue  # all of its cameras are doubtful
-        into_house = house.house_from_world(inside[0], group.cameras[inside[0]])
         if number < len(clouds):
-            shown_clouds.append(_moved(clouds[number], into_house))
+            nearest = _nearest_cameras(clouds[number].points_in_world, group)
+            for move, cameras in _by_move(moves):
+                shown_clouds.append(_moved(clouds[number].some(np.isin(nearest, cameras)), move))
         mesh, note = run_mesh(run, number) if with_mesh else (None, "")
         notes.append(note)
         if mesh is not None:
-            meshes.append(mesh.moved(into_house))
-    by_links = sum(by == PlacedBy.LINKS for by in house.placed_by)
-    notes.append(f"links of the tour say where {by_links} of {len(house.names)} panoramas are; their places are rough")
-    cameras = [
+            nearest = _nearest_cameras(mesh.vertices, group)
+            for move, cameras in _by_move(moves):
+                inside = np.isin(nearest, cameras)[mesh.faces].all(axis=1)
+                if inside.any():
+                    meshes.append(replace(mesh, faces=mesh.faces[inside]).moved(move))
+    count = sum(by == PlacedBy.LINKS for by in house.placed_by)
+    notes.append(
+        f"links of the tour say where {count} of {len(house.names)} panoramas {plural(count, 'is', 'are')}; their "
+        f"{plural(count, 'place is', 'places are')} rough"
+    )
+    if run.cloud is not None and len(run.cloud) and not shown_clouds:
+        notes.append("the cloud is not shown, because all cameras that see it are doubtful")
+    cameras_of_house = [
         ShownCamera(
             name,
             house.cam_from_house(idx),
@@ -98,9 +116,43 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
         )
         for idx, name in enumerate(house.names)
     ]
+    first = next((int(group) for part, group in zip(house.parts, house.groups, strict=True) if part == 0), -1)
+    known = run.summary.poses.by_group()
+    world = known[first] if 0 <= first < len(known) else None
     return Shown(
-        tuple(cameras), _joined(shown_clouds), joined_meshes(meshes), has_plan=False, notes=tuple(filter(None, notes))
+        tuple(cameras_of_house),
+        _joined(shown_clouds),
+        joined_meshes(meshes),
+        metric=world is not None and world.metric,
+        is_level=world is None or world.axes.is_level,
+        has_plan=False,
+        notes=tuple(filter(None, notes)),
     )
+
+
+def _moves(group: Poses, house: House, number: int) -> list[tuple[int, Similarity3] | None]:
+    """Return the part of each camera of a group and how it moves into the house; None for doubtful cameras."""
+    part_of = {
+        name: int(part) for name, part, own in zip(house.names, house.parts, house.groups, strict=True) if own == number
+    }
+    cameras = group.cameras
+    move_of: dict[int, Similarity3] = {}
+    for name, part in part_of.items():
+        if part not in move_of and name in cameras:
+            move_of[part] = house.house_from_world(name, cameras[name])
+    return [(part_of[name], move_of[part_of[name]]) if name in part_of else None for name in group.names]
+
+
+def _by_move(moves: Sequence[tuple[int, Similarity3] | None]) -> Iterator[tuple[Similarity3, list[int]]]:
+    """Yield how the parts of a group move, each with the positions of its cameras."""
+    known = {move[0]: move[1] for move in moves if move is not None}
+    for part, move in known.items():
+        yield move, [idx for idx, own in enumerate(moves) if own is not None and own[0] == part]
+
+
+def _nearest_cameras(points: NDArray[np.float32], group: Poses) -> NDArray[np.intp]:
+    """Return the position of the camera nearest to each point (P, 3): what it saw moves with it."""
+    return np.asarray(cKDTree(group.centers).query(points)[1], np.intp)
 
 
 def _moved(cloud: PointCloud, into_house: Similarity3) -> PointCloud:

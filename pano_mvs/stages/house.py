@@ -36,9 +36,10 @@ def links(poses: One[Poses], images: All[Panorama], ctx: Context) -> House:
     ctx.metric("by_links", counts[PlacedBy.LINKS])
     if counts[PlacedBy.LINKS]:
         by_links = [name for name, by in zip(house.names, house.placed_by, strict=True) if by == PlacedBy.LINKS]
+        stand = plural(len(by_links), "panorama stands", "panoramas stand")
         ctx.note(
-            f"links of the tour say where {len(by_links)} {plural(len(by_links), 'panorama')} stand that matches do "
-            f"not join with the others: {shortened_list(by_links)}"
+            f"links of the tour say where {len(by_links)} {stand} that matches do not join with the others: "
+            f"{shortened_list(by_links)}"
         )
     return house
 

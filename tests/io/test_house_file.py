@@ -18,6 +18,7 @@ def house() -> House:
         names=("a", "b"),
         rotations=np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]),
         translations=np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]),
+        parts=np.array([0, 1], np.int32),
         groups=np.array([0, -1], np.int32),
         scales=np.array([1.0, 1.0]),
         placed_by=("matches", "links"),

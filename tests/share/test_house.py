@@ -17,6 +17,7 @@ from pano_mvs.scene.image_file import write_png
 from pano_mvs.share import share_run
 from pano_mvs.share.mesh_file import SharedMesh, joined_meshes
 from pano_mvs.share.share import page_from_world
+from pano_mvs.share.shown import shown_of
 from tests.share.box_run import NAMES, box_run
 from tests.share.test_share import value_of
 from tests.viewer.scenes import turned_poses
@@ -36,6 +37,7 @@ def with_house(run: RunOutput, images: Path) -> tuple[RunOutput, dict[str, Rigid
         names=tuple(cameras),
         rotations=np.array([pose.rotation for pose in cameras.values()]),
         translations=np.array([pose.translation for pose in cameras.values()]),
+        parts=np.array([0, 0, 1, 2, 3], np.int32),
         groups=np.array([0, 0, -1, -1, -1], np.int32),
         scales=np.ones(5),
         placed_by=("matches", "matches", "links", "links", "nothing"),
@@ -68,12 +70,41 @@ def test_single_panoramas_stand_where_links_say(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_where_ranges_are_not_known_links_say_what_can_be_seen(tmp_path: Path) -> None:
+def test_each_scene_has_its_links_and_doubtful_ones_no_ranges(tmp_path: Path) -> None:
     run, _ = with_house(box_run(tmp_path, points=2_000), tmp_path / "images")
     share_run(run, tmp_path / "page", images=tmp_path / "images")
     cameras = scene_of(tmp_path / "page")["cameras"]
     assert [camera["ranges"] is None for camera in cameras] == [False, False, True, True, True]
-    assert [camera.get("leadsTo") for camera in cameras] == [None, None, [], [0], []]
+    assert [camera.get("leadsTo") for camera in cameras] == [[3], [], [], [0], []]
+
+
+def test_what_doubtful_cameras_saw_is_not_shown_and_a_part_moves_as_a_whole(tmp_path: Path) -> None:
+    run, _ = with_house(box_run(tmp_path, points=2_000), tmp_path / "images")
+    alone = share_run(run, tmp_path / "page", images=tmp_path / "images")
+    assert 0 < alone.points < 2_000, "points nearest to the doubtful camera are left out"
+    document = json.loads((run.out / "house.json").read_text())
+    for row in document["panoramas"][:2]:
+        row["center"][0] += 50.0
+    (run.out / "house.json").write_text(json.dumps(document))
+    moved = shown_of(load(run.out), with_mesh=False)
+    before = box_run(tmp_path / "again", points=2_000).cloud
+    assert moved.cloud is not None
+    assert before is not None
+    assert len(moved.cloud) == alone.points
+    assert np.median(moved.cloud.points_in_world[:, 0]) > 45.0
+
+
+def test_the_unit_is_that_of_the_largest_part(tmp_path: Path) -> None:
+    run, _ = with_house(box_run(tmp_path, points=2_000, metric=True), tmp_path / "images")
+    assert shown_of(run, with_mesh=False).metric
+    document = json.loads((run.out / "house.json").read_text())
+    for number, row in enumerate(document["panoramas"]):
+        row |= {"part": number, "group": None, "placed_by": "links"}
+    (run.out / "house.json").write_text(json.dumps(document))
+    shown = shown_of(load(run.out), with_mesh=False)
+    assert not shown.metric
+    assert shown.cloud is None
+    assert any("all cameras that see it are doubtful" in note for note in shown.notes)
 
 
 def test_a_damaged_house_file_is_named_and_the_largest_group_shown(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -33,6 +34,18 @@ class _Levelled:
     group: int  # number of the group; -1 for a single panorama
 
 
+class _Row(NamedTuple):
+    """A panorama of a house, as `House` has it."""
+
+    cam_from_house: Rigid3
+    part: int
+    group: int
+    scale: float
+    placed_by: PlacedBy
+    center_std: float
+    turn_std_rad: float
+
+
 def house_of_links(
     poses: Poses,
     links: Mapping[str, Sequence[SceneLink]],
@@ -40,7 +53,7 @@ def house_of_links(
     *,
     up_in_cam: Mapping[str, Sequence[float]] | None = None,
 ) -> House:
-    """Return where all panoramas of a tour stand, in the frame and unit of the largest group of cameras.
+    """Return where all panoramas of a tour stand, in the frame and unit of the group of the largest part.
 
     Cameras of a tour stand at one height above the floor, so that groups and single panoramas have one unit. Links
     give directions and rough distances (see `layout`), and the lines of walls the exact turn around the vertical. All
@@ -51,7 +64,7 @@ def house_of_links(
 
     Args:
         poses: of the panoramas that are in groups; others are single.
-        links: image name to its links. With less than one between two parts, no picture is loaded.
+        links: image name to its links. If none joins two parts, no picture is loaded.
         pictures: image name to a function that loads it, of all panoramas in the capture's order.
         up_in_cam: direction away from gravity by sensors of cameras; others are taken to be level.
     """
@@ -69,9 +82,11 @@ def house_of_links(
             level = Rigid3(rotation_from_two_vectors(np.asarray(ups.get(name, UP), np.float64), UP), np.zeros(3))
             levelled.append(_Levelled(Part({name: level.inverse()}), Rigid3.identity(), 0.0, -1))
     parts = [one.part for one in levelled]
-    if len({number for link in part_links(parts, links) for number in link.parts}) > 1:
+    between = any(link.parts[0] != link.parts[1] for link in part_links(parts, links))
+    if between:
         parts = [_with_walls(part, pictures) for part in parts]
-    places = layout(parts, part_links(parts, links), rng=np.random.default_rng(0))
+    used = part_links(parts, links) if between else []
+    places = layout(parts, used, rng=np.random.default_rng(0)) if parts else []
     return _house(levelled, places, links, order=tuple(pictures))
 
 
@@ -92,7 +107,8 @@ def _certain(group: Poses) -> list[list[str]]:
 def _of_group(group: Poses, number: int) -> _Levelled:
     cameras = list(group.cameras.values())
     up = None if group.worlds[0].axes.is_level else mean_up_direction([camera.rotation for camera in cameras])
-    level = Rigid3(np.eye(3) if up is None else rotation_from_two_vectors(up, UP), np.zeros(3))
+    rotation = np.eye(3) if up is None else rotation_from_two_vectors(up, UP)
+    level = Rigid3(rotation, -rotation @ np.mean([camera.center for camera in cameras], axis=0))
     own = {name: camera @ level.inverse() for name, camera in group.cameras.items()}
     ups = [camera.rotation @ UP for camera in own.values()]
     height = height_over_points(level.apply(group.points_in_world), list(own.values()), ups)
@@ -117,13 +133,19 @@ def _house(
     order: Sequence[str],
 ) -> House:
     """Return the house in which parts stand at their places; those without a place stand beside it."""
+    if not levelled:
+        return _of_rows({}, links, order=order, camera_height=None)
     first = places[0]
     assert first is not None
     world_from_level = levelled[0].level_from_world.inverse()
-    rows: dict[str, tuple[Rigid3, int, float, PlacedBy, float, float]] = {}
+    world_from_first = Similarity3(1.0, world_from_level.rotation, world_from_level.translation)
+    joined = sum(place is not None for place in places) > 1
+    rows: dict[str, _Row] = {}
     right = max(_reach(one.part, place) for one, place in zip(levelled, places, strict=True) if place is not None)
     for number, (one, place) in enumerate(zip(levelled, places, strict=True)):
-        by = PlacedBy.LINKS if number or one.part.is_single else PlacedBy.MATCHES
+        by = PlacedBy.MATCHES if not number and not one.part.is_single else PlacedBy.LINKS
+        if not number and one.part.is_single and not joined:
+            by = PlacedBy.NOTHING
         if place is None:
             scale = 1.0 if one.part.is_single else 1 / one.part.height if np.isfinite(one.part.height) else first.scale
             beside = Place(np.zeros(2), 0.0, scale, np.inf, np.inf)
@@ -134,24 +156,37 @@ def _house(
         x, z = place.position / first.scale
         height = levelled[0].height_of_cameras - scale * one.height_of_cameras
         level_from_part = Similarity3(scale, rotation_from_rotvec((0.0, place.turn_rad, 0.0)), np.array([x, height, z]))
-        house_from_part = Similarity3(1.0, world_from_level.rotation, np.zeros(3)) @ level_from_part
+        house_from_part = world_from_first @ level_from_part
         for name, camera in one.part.cameras.items():
             pose = house_from_part.move_camera(camera)
-            rows[name] = (pose, one.group, scale, by, place.position_std / first.scale, place.turn_std_rad)
-    names = tuple(name for name in order if name in rows)
-    columns = [*zip(*(rows[name] for name in names), strict=True)]
+            deviations = place.position_std / first.scale, place.turn_std_rad
+            rows[name] = _Row(pose, number, one.group, scale if one.group >= 0 else 1.0, by, *deviations)
     height = levelled[0].part.height
+    known = float(height) if np.isfinite(height) else float(1 / first.scale) if joined else None
+    return _of_rows(rows, links, order=order, camera_height=known)
+
+
+def _of_rows(
+    rows: Mapping[str, _Row],
+    links: Mapping[str, Sequence[SceneLink]],
+    *,
+    order: Sequence[str],
+    camera_height: float | None,
+) -> House:
+    names = tuple(name for name in order if name in rows)
+    found = [rows[name] for name in names]
     return House(
         names=names,
-        rotations=np.array([pose.rotation for pose in columns[0]]),
-        translations=np.array([pose.translation for pose in columns[0]]),
-        groups=np.array(columns[1], np.int32),
-        scales=np.array([scale if group >= 0 else 1.0 for group, scale in zip(columns[1], columns[2], strict=True)]),
-        placed_by=tuple(str(by) for by in columns[3]),
-        center_stds=np.array(columns[4], np.float64),
-        turn_stds_rad=np.array(columns[5], np.float64),
-        links=tuple(tuple(link.name for link in links.get(name, ()) if link.name in rows) for name in names),
-        camera_height=float(height) if np.isfinite(height) else float(1 / first.scale) if len(places) > 1 else None,
+        rotations=np.array([row.cam_from_house.rotation for row in found]).reshape(-1, 3, 3),
+        translations=np.array([row.cam_from_house.translation for row in found]).reshape(-1, 3),
+        parts=np.array([row.part for row in found], np.int32),
+        groups=np.array([row.group for row in found], np.int32),
+        scales=np.array([row.scale for row in found], np.float64),
+        placed_by=tuple(str(row.placed_by) for row in found),
+        center_stds=np.array([row.center_std for row in found], np.float64),
+        turn_stds_rad=np.array([row.turn_std_rad for row in found], np.float64),
+        links=tuple(tuple(link.name for link in links.get(name, ()) if link.name in names) for name in names),
+        camera_height=camera_height,
     )
 
 

@@ -17,17 +17,21 @@ _LENGTH_STD = 0.4  # of the logarithm of the length of a link that meets the flo
 _USUAL_LENGTH, _USUAL_STD = 2.3, 0.5  # of a link, in camera heights, and standard deviation of its logarithm
 _WALL_STD = np.deg2rad(2.0)
 _HEIGHT_STD = 0.06  # of the logarithm of a height above the floor; see `joining.floors`
-_STARTS = 16
+_STARTS, _LEAST_STARTS = 16, 4  # trees from which the search begins; fewer for more than 12 parts
+_EQUALLY_GOOD = 1.0  # difference of costs, which are half the sums of squares, within which solutions may be right
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a part stands in the plan of a house, whose unit is the height of the cameras above the floor."""
+    """Where a part stands in the plan of a house, whose unit is the height of the cameras above the floor.
 
-    position: FloatArray  # (2,) x and z of the origin of the part
+    Deviations are relative to the first part, and infinite if nothing determines the value.
+    """
+
+    position: FloatArray  # (2,) x and z of the origin of the part, which lies amid its cameras
     turn_rad: float  # by which directions in the part are turned, from z towards x
     scale: float  # the unit of the part
-    position_std: float  # relative to the first part
+    position_std: float
     turn_std_rad: float
 
 
@@ -37,7 +41,8 @@ def layout(parts: Sequence[Part], links: Sequence[PartLink], *, rng: np.random.G
     The robust cost of all links is minimised: of their directions, of their lengths where they meet the floor, and of
     walls, which are at right angles in the whole house. Links are hardly exact, and through doors they show the door,
     so that single ones may be 30° off. As directions have many local minima, the search begins with several trees of
-    links, in which two links that lead back and forth say how one part is turned relative to the other.
+    links, in which two links that lead back and forth say how one part is turned relative to the other. Where solutions
+    that are equally good differ, their difference counts as deviation.
 
     Args:
         parts: the one in whose frame the others are placed is the first.
@@ -46,19 +51,27 @@ def layout(parts: Sequence[Part], links: Sequence[PartLink], *, rng: np.random.G
     """
     joined = _joined(len(parts), links)
     used = [link for link in links if link.parts[0] in joined]
-    found: tuple[float, FloatArray, FloatArray] | None = None
-    for _ in range(_STARTS if len(joined) > 1 else 1):
-        start = _start(parts, joined, used, rng)
 
-        def residuals(values: FloatArray) -> FloatArray:
-            return _residuals(values.reshape(-1, 4), parts, joined, used)
+    def residuals(values: FloatArray) -> FloatArray:
+        return _residuals(values.reshape(-1, 4), parts, joined, used)
 
-        solved = least_squares(residuals, start.ravel(), loss="cauchy")
-        if found is None or solved.cost < found[0] - 1e-9:
-            found = float(solved.cost), solved.x.reshape(-1, 4), np.asarray(solved.jac)
-    assert found is not None
-    values = found[1]
-    stds = _deviations(found[2]).reshape(-1, 4)
+    starts = min(_STARTS, max(_LEAST_STARTS, 12 * _STARTS // len(joined))) if len(joined) > 1 else 1
+    solutions = [
+        least_squares(residuals, _start(parts, joined, used, rng).ravel(), loss="cauchy", xtol=1e-10, ftol=1e-10)
+        for _ in range(starts)
+    ]
+    # Of solutions whose costs differ by no more than rounding, the first one.
+    least = min(float(one.cost) for one in solutions)
+    best = next(one for one in solutions if one.cost <= least * (1 + 1e-6) + 1e-6)
+    values = best.x.reshape(-1, 4)
+    stds = _deviations(np.asarray(best.jac)).reshape(-1, 4)
+    position_stds, turn_stds = np.hypot(stds[:, 0], stds[:, 1]), stds[:, 2]
+    for one in solutions:
+        if one.cost <= least + _EQUALLY_GOOD:
+            off = one.x.reshape(-1, 4) - values
+            position_stds = np.maximum(position_stds, np.hypot(off[:, 0], off[:, 1]))
+            turn_stds = np.maximum(turn_stds, np.abs(_within(off[:, 2], 2 * np.pi)))
+    position_stds[0] = turn_stds[0] = 0.0
     places: list[Place | None] = [None] * len(parts)
     for row, number in enumerate(joined):
         x, z, turn, log_scale = values[row].tolist()
@@ -66,8 +79,8 @@ def layout(parts: Sequence[Part], links: Sequence[PartLink], *, rng: np.random.G
             np.array([x, z]),
             float(np.angle(np.exp(1j * turn))),
             float(np.exp(log_scale)),
-            float(np.hypot(*stds[row, :2])),
-            float(stds[row, 2]),
+            float(position_stds[row]),
+            float(turn_stds[row]),
         )
     return places
 
@@ -124,8 +137,10 @@ def _first_scale(part: Part) -> float:
     if np.isfinite(part.height):
         return 1 / part.height
     centers = np.array([pose.center for pose in part.cameras.values()])
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(centers), np.inf))
-    return float(_USUAL_LENGTH / np.median(apart.min(axis=1)))
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+    nearest = np.where(apart > 1e-6 * apart.max(), apart, np.inf).min(axis=1)  # copies stand at one position
+    known = np.isfinite(nearest)
+    return float(_USUAL_LENGTH / np.median(nearest[known])) if known.any() else 1.0
 
 
 def _snapped(turn: float, parts: Sequence[Part], number: int) -> float:

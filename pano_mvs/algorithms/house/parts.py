@@ -18,7 +18,10 @@ _MIN_DOWN_DEG = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A group of cameras with known relative poses, or a single panorama, in a level frame: y points down."""
+    """A group of cameras with known relative poses, or a single panorama.
+
+    Its frame is level, with y down, and has its origin amid the cameras.
+    """
 
     cameras: Mapping[str, Rigid3]  # cam_from_part by image name
     height: float = np.nan  # of its cameras above the floor, in its own unit; NaN if not known

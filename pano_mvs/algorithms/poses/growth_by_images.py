@@ -74,34 +74,27 @@ def model_by_images(
     """
     small = confirmation.at_width(_WIDTH_PX)
     best = by_pairs = grown_model(pairs, images, adjust=adjust)
-    best_of_seed = False
-    many = len(images) > _MANY
-    for model in _starts(pairs, images, small, adjust=adjust):
-        of_seed = len(model.cameras) == 2
-        if many and of_seed and best is not by_pairs:
-            break
-        found = _completed(model, images, small, adjust=adjust)
-        if of_seed and best_of_seed and found[0].is_same_arrangement(best[0]):
-            break
-        if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
-            best, best_of_seed = found, of_seed
-        elif many and of_seed:
-            break
-    return best
-
-
-def _starts(
-    pairs: Pairs, images: Collection[int], confirmation: Confirmation, *, adjust: bool
-) -> Iterator[PlacedModel]:
-    """Yield the models from which to grow: those of neighbours in the order of capture, then seeds."""
     for steps in _STEPS:
         model = _of_neighbours(pairs, images, steps, adjust=adjust)
         if model is not None:
-            yield model
-    for seed in _seeds(pairs, images, confirmation):
+            found = _completed(model, images, small, adjust=adjust)
+            if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
+                best = found
+    many = len(images) > _MANY
+    if many and best is not by_pairs:
+        return best
+    is_of_seed = False
+    for seed in _seeds(pairs, images, small):
         model = PlacedModel(pairs)
         model.seed(*seed)
-        yield model
+        found = _completed(model, images, small, adjust=adjust)
+        if is_of_seed and found[0].is_same_arrangement(best[0]):
+            break
+        if is_better_arrangement(found[0].cameras, best[0].cameras, confirmation):
+            best, is_of_seed = found, True
+        elif many:
+            break
+    return best
 
 
 def _seeds(pairs: Pairs, images: Collection[int], confirmation: Confirmation) -> list[Seed]:

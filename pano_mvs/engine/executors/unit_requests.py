@@ -30,7 +30,6 @@ from pano_mvs.engine.stages.stage import Cardinality, SourceItem, StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest, stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
-from pano_mvs.scene import SceneLink
 
 TEXT_VERSION = 3
 LARGE_INPUT = 2000  # the inputs of an All port are written into a file if they are more than this
@@ -141,8 +140,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     source = text["source"]
     if source is not None:
         files = {role: Path(path) for role, path in source["files"].items()}
-        links = tuple(map(SceneLink.from_value, source["links"]))
-        source = SourceItem(source["name"], files, links=links, digests=source["digests"])
+        source = SourceItem(source["name"], files, links=tuple(source["links"]), digests=source["digests"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],

@@ -110,6 +110,10 @@ class SourceItem:
     links: tuple[SceneLink, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Convert links that are given by their names, or stored as lists."""
+        object.__setattr__(self, "links", tuple(map(SceneLink.from_value, self.links)))
+
     def file(self, role: str) -> FilePart:
         """Return a file as part of a record; its `read_bytes` raises if the file has changed since it was listed."""
         return FilePart(self.files[role], external=True, digest=self.digests.get(role, ""))

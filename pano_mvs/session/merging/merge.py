@@ -44,6 +44,7 @@ from pano_mvs.engine.stages.stage import Cardinality, StageSpec
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.io.growing_arrays import GrowingArrays
+from pano_mvs.io.house_file import HOUSE_FILE
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.ply import open_ply_points
 from pano_mvs.report.page import gather_report, write_page
@@ -378,7 +379,9 @@ def _repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) ->
     exports = [(outcome, spec) for outcome, spec in found if spec.output is Files and spec.name not in _MERGED]
     repeated = [(outcome, spec) for outcome, spec in exports if _is_repeated(spec)]
     written: dict[str, str] = {}
-    left_out = dict.fromkeys(spec.name for _, spec in exports if not _is_repeated(spec))
+    # Blocks of anything but a tour have no house.
+    absent = {"export.house"} - ({"export.house"} if HOUSE_FILE in block.files else set())
+    left_out = dict.fromkeys(spec.name for _, spec in exports if not _is_repeated(spec) and spec.name not in absent)
     notes = [f"of each block, and not merged: the files of {', '.join(left_out)}"] if left_out else []
     if not repeated or not has_cloud:
         return written, notes

@@ -280,8 +280,9 @@ class Page {
       if (this.mode !== "inside" || !this.here) continue;
       const there = panorama.center.clone().sub(this.here.center);
       const seen = this.here.pick(there);
-      const leads = this.here.camera.leadsTo; // without ranges, what walls hide is not known
-      if (leads && !leads.includes(index)) { ring.visible = false; continue; }
+      const leads = this.here.camera.leadsTo; // in a tour, whose links lead through walls; without ranges, they alone count
+      const rough = leads && (!this.here.camera.ranges || (panorama.camera.placed && !seen));
+      if (leads?.includes(index) || rough) { ring.visible = panorama.camera.levels > 0 && leads.includes(index); continue; }
       ring.visible = panorama !== this.here && panorama.camera.levels > 0 && (!seen || seen.point.distanceTo(this.here.center) > 0.85 * there.length());
     }
   }

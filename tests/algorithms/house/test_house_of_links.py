@@ -93,6 +93,45 @@ def test_a_capture_without_links_loads_no_picture() -> None:
     assert PlacedBy.LINKS not in house.placed_by
 
 
+def test_without_links_doubtful_cameras_make_no_house() -> None:
+    """A page of such a capture lost its cloud, because its first panorama counted as placed by links."""
+    tour = made_tour()
+    poses = poses_of(tour, (0, 1))
+    poses.doubts.update({"0": "", "1": ""})
+    house = house_of_links(poses, {}, BLANK)
+    assert PlacedBy.LINKS not in house.placed_by
+    assert house.camera_height is None
+
+
+def test_copies_at_one_position_have_a_house() -> None:
+    tour = made_tour()
+    poses = poses_of(tour, (0, 0, 2))
+    twin = Poses.without_points(
+        {"0": poses.cameras["0"], "1": poses.cameras["0"]}, frame="", scale="", metric=False, axes=WorldAxes.LEVEL
+    )
+    house = house_of_links(twin, tour.links, BLANK)
+    house.check()
+    assert np.isfinite(house.translations).all()
+
+
+@pytest.mark.parametrize("far", [0.0, 300.0])
+def test_deviations_do_not_depend_on_the_origin_of_the_world(far: float) -> None:
+    tour = made_tour()
+    near = poses_of(tour, (0, 1, 2))
+    shift = Similarity3(1.0, np.eye(3), np.array([far, 0.0, 0.0]))
+    poses = Poses.without_points(
+        {name: shift.move_camera(pose) for name, pose in near.cameras.items()},
+        frame="",
+        scale="",
+        metric=False,
+        axes=WorldAxes.LEVEL,
+    )
+    stds = house_of_links(poses, tour.links, BLANK).center_stds
+    assert np.allclose(stds, house_of_links(near, tour.links, BLANK).center_stds, rtol=0.05, atol=0.01)
+    assert stds[0] == 0
+    assert np.isfinite(stds).all()
+
+
 def test_a_tour_of_which_nothing_is_matched_is_a_house_by_its_links() -> None:
     tour = made_tour()
     nothing = Poses.without_points({}, frame="", scale="", metric=False)

@@ -90,6 +90,27 @@ def test_a_link_in_one_direction_alone_gives_the_position() -> None:
     assert not np.isfinite(places[1].turn_std_rad), "nothing says how it is turned"
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turn_that_several_solutions_give_is_not_said_to_be_sure(seed: int) -> None:
+    """Walls are parallel after each quarter of a turn, and a link in one direction alone tells none of them."""
+    tour = made_tour(seed=seed, one_way=(2,))
+    places = placed([group(tour, (0, 1)), single(tour, 4)], tour)
+    assert places[1].turn_std_rad > np.deg2rad(60.0)
+
+
+def test_rounding_does_not_choose_between_equal_solutions() -> None:
+    tour = made_tour(seed=6, noise_deg=8.0, one_way=(0, 2, 4))
+    parts = [group(tour, (0, 1)), *(single(tour, number) for number in (2, 3, 4, 5))]
+    links = part_links(parts, tour.links)
+    rounded = [link._replace(azimuth_rad=link.azimuth_rad * (1 + 1e-15)) for link in links]
+    first, second = (layout(parts, each, rng=np.random.default_rng(0)) for each in (links, rounded))
+    for one, other in zip(first, second, strict=True):
+        assert one is not None
+        assert other is not None
+        assert one.turn_rad == pytest.approx(other.turn_rad, abs=1e-3)
+        assert np.allclose(one.position, other.position, atol=1e-3)
+
+
 def test_links_on_the_horizon_stand_at_a_usual_distance() -> None:
     tour = made_tour(seed=5, on_floor=False)
     places = placed([group(tour, (0, 1)), single(tour, 4)], tour)

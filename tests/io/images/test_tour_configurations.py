@@ -44,7 +44,7 @@ def test_titles_order_and_links_come_from_the_configuration(tmp_path: Path, prog
     scenes = scenes_of(tmp_path)
     assert [scene.name for scene in scenes] == ["Kitchen", "Hall 1 2", "b"]
     assert [targets(scene) for scene in scenes] == [("Hall 1 2", "b"), (), ()]
-    assert np.allclose([link.direction_deg for link in scenes[0].links], [[YAW_DEG, PITCH_DEG]] * 2)
+    assert [link.direction_deg for link in scenes[0].links] == [pytest.approx((YAW_DEG, PITCH_DEG))] * 2
     assert all(len(scene.tiles) == 24 for scene in scenes)
     assert is_tour(tmp_path)
     items = list(list_tour(TourParams.model_validate({"path": tmp_path})))
@@ -274,7 +274,7 @@ def test_our_own_exports_are_read(tmp_path: Path, file: str) -> None:
     (tmp_path / file).write_text(WRITERS[file](made))
     scenes = scenes_of(tmp_path)
     assert [(scene.name, targets(scene)) for scene in scenes] == [("Room 0", ("Room 1",)), ("Room 1", ("Room 0",))]
-    assert np.allclose([link.direction_deg for scene in scenes for link in scene.links], [[150.0, -20.0]] * 2)
+    assert [link.direction_deg for scene in scenes for link in scene.links] == [pytest.approx((150.0, -20.0))] * 2
     assert [scene.panorama for scene in scenes] == [tmp_path / f"pictures/no {n}.jpg" for n in range(2)]
     assert not is_tour(tmp_path), "source.folder reads panoramas without a change"
 

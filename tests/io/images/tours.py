@@ -98,11 +98,11 @@ def write_configuration(
         }
         text = json.dumps({"default": {"basePath": "./tour"}, "scenes": stated})
     else:
-        place = f"ath='{YAW_DEG}' atv='{-PITCH_DEG}'"
+        at = f"ath='{YAW_DEG}' atv='{-PITCH_DEG}'"
         text = "".join(
             f"<scene name={quoteattr(key)} title={quoteattr(title)}><image><cube url="
             f"{quoteattr(f'panos/{key}.tiles/%s/l%l/%0v/l%l_%s_%0v_%0h.png')} multires='{half},{half},{SIDE}'/></image>"
-            + "".join(f"<hotspot linkedscene={quoteattr(to.upper())} {place}/>" for to in links.get(key, []))
+            + "".join(f"<hotspot linkedscene={quoteattr(to.upper())} {at}/>" for to in links.get(key, []))
             + "</scene>"
             for key, title in titles.items()
         )
