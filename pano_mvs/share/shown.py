@@ -32,7 +32,7 @@ class ShownCamera:
     cam_from_world: Rigid3
     scale: float | None = 1.0  # unit of its ranges; None if these do not fit the place where it is shown
     placed: str = ""  # what says where it is, unless matches do
-    leads_to: tuple[str, ...] | None = None  # panoramas to which links of a tour lead; None if it is no tour
+    leads_to: tuple[str, ...] | None = None  # panoramas to which links of a tour lead; None without them
 
 
 @dataclass(frozen=True, eq=False)
