@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.core.errors import ContractError, InputError
+from pano_mvs.core.file_names import item_problem
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, House
 
@@ -79,6 +80,9 @@ def read_house(path: Path) -> House:
             camera_height=document["camera_height"],
         )
         house.check()
+        for name in (*house.names, *(target for targets in house.links for target in targets)):
+            if problem := item_problem(name):
+                raise ValueError(problem)
     except (KeyError, TypeError, ValueError, ContractError) as error:
         raise InputError(f"{path}: does not say where panoramas stand in a house ({error}). Run again") from error
     return house

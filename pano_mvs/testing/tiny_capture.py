@@ -20,8 +20,10 @@ from pano_mvs.scene import (
     Features,
     FilePart,
     GlobalDescriptor,
+    House,
     Pairs,
     Panorama,
+    PlacedBy,
     PointCloud,
     Pose,
     Poses,
@@ -124,8 +126,29 @@ class TinyCapture:
             StaticMasks: frozen(StaticMasks(pixels[None], (camera,))),
             Structure: self._structure(),
             Scores: Scores({"registered": 1.0}, {}),
+            House: self._house(),
             Photographs: self._photographs(),
         }
+
+    def _house(self) -> House:
+        """Return the house of the capture, whose last camera only links place."""
+        count = len(self.names)
+        single = np.arange(count) == count - 1
+        return frozen(
+            House(
+                names=self.names,
+                rotations=np.array([pose.rotation for pose in self.poses]),
+                translations=np.array([pose.translation for pose in self.poses]),
+                parts=single.astype(np.int32),
+                groups=np.where(single, -1, 0).astype(np.int32),
+                scales=np.ones(count),
+                placed_by=tuple(str(PlacedBy.LINKS if one else PlacedBy.MATCHES) for one in single),
+                center_stds=np.where(single, 0.5, 0.0),
+                turn_stds_rad=np.where(single, 0.1, 0.0),
+                links=tuple((self.names[0],) if one else () for one in single),
+                camera_height=1.5,
+            )
+        )
 
     def each(self, kind: type[Frozen]) -> dict[Any, Frozen]:
         """Return the items of a kind."""

@@ -53,11 +53,11 @@ def layout(parts: Sequence[Part], links: Sequence[PartLink], *, rng: np.random.G
     used = [link for link in links if link.parts[0] in joined]
 
     def residuals(values: FloatArray) -> FloatArray:
-        return _residuals(values.reshape(-1, 4), parts, joined, used)
+        return _residuals(values.reshape(-1, 4), parts, used, joined=joined)
 
     starts = min(_STARTS, max(_LEAST_STARTS, 12 * _STARTS // len(joined))) if len(joined) > 1 else 1
     solutions = [
-        least_squares(residuals, _start(parts, joined, used, rng).ravel(), loss="cauchy", xtol=1e-10, ftol=1e-10)
+        least_squares(residuals, _start(parts, joined, used, rng=rng).ravel(), loss="cauchy", xtol=1e-10, ftol=1e-10)
         for _ in range(starts)
     ]
     # Of solutions whose costs differ by no more than rounding, the first one.
@@ -96,7 +96,7 @@ def _joined(count: int, links: Sequence[PartLink]) -> list[int]:
 
 
 def _start(
-    parts: Sequence[Part], joined: Sequence[int], links: Sequence[PartLink], rng: np.random.Generator
+    parts: Sequence[Part], joined: Sequence[int], links: Sequence[PartLink], *, rng: np.random.Generator
 ) -> FloatArray:
     """Return rows of x, z, turn and logarithm of the scale, (K, 4), along a random tree of links."""
     scales = {number: _first_scale(parts[number]) for number in joined}
@@ -161,7 +161,7 @@ def _turned(xz: FloatArray, turn: FloatArray | float) -> FloatArray:
 
 
 def _residuals(
-    values: FloatArray, parts: Sequence[Part], joined: Sequence[int], links: Sequence[PartLink]
+    values: FloatArray, parts: Sequence[Part], links: Sequence[PartLink], *, joined: Sequence[int]
 ) -> FloatArray:
     """Return the residuals of the places of the joined parts, (K, 4), in standard deviations."""
     row = {number: idx for idx, number in enumerate(joined)}

@@ -172,7 +172,7 @@ def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmat
         for camera in sorted(changed):
             maps[camera] = confirmation.ranges(camera, model.cameras)
             model.confirmed_ranges[camera] = ranges_of_key_points(maps[camera], model.pairs.bearings[camera])
-        options = _options(model, left, confirmation, maps, known=options)
+        options = _options(model, left, confirmation, maps=maps, known=options)
         usable = [option for option in options if option.share >= CHANCE_SHARE]
         best = max(usable, key=lambda option: (option.score, -option.image), default=None)
         if best is None:
@@ -221,8 +221,8 @@ def _options(
     model: PlacedModel,
     images: Collection[int],
     confirmation: Confirmation,
-    maps: Mapping[int, NDArray[np.float32]],
     *,
+    maps: Mapping[int, NDArray[np.float32]],
     known: list[_Option],
 ) -> list[_Option]:
     """Return the places of the images that are connected best with a model; of the next ones if these have none.
@@ -253,7 +253,7 @@ def _options(
                 and geodesic_angle(option.suggested.rotation, pose.rotation) < np.deg2rad(1.0)
             )
             option = next(before, None) or _Option(image, pose, sources, surroundings.appearance(image, pose), pose)
-            yield option, partial(_refined, model, image, evidence, place)
+            yield option, partial(_refined, model, image, evidence, place=place)
 
     weights = {image: _connection(model, image) for image in images}
     connected = sorted((image for image in images if weights[image] > 0), key=lambda idx: (-weights[idx], idx))
@@ -272,7 +272,7 @@ def _options(
     return compared
 
 
-def _refined(model: PlacedModel, image: int, evidence: PairEvidence, place: Placement) -> Rigid3:
+def _refined(model: PlacedModel, image: int, evidence: PairEvidence, *, place: Placement) -> Rigid3:
     return model.polished(image, evidence, place)[0]
 
 

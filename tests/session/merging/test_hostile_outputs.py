@@ -22,6 +22,7 @@ from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
 from pano_mvs.evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
 from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.house_file import read_house
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.poses.metashape import write_metashape
@@ -146,6 +147,7 @@ _OTHERS = {  # readers of files that state names, with the test of them; the rea
     "viewer.shown_scene.open_scene": "test_commands_write_nothing_for_hostile_names",
     "share.maps.run_plans": "test_hostile_names_of_floor_plans_are_left_out",
     "io.ranges.keys_of_npz": "test_arrays_of_an_archive_are_not_names_of_files",
+    "io.house_file.read_house": "test_hostile_names_of_a_house_are_refused",
     "io.rig_calibration.read_rig": "test_hostile_names_of_lenses_are_refused",
 }
 _NO_NAMES = {
@@ -315,3 +317,14 @@ def test_hostile_names_of_lenses_are_refused(tmp_path: Path, name: str) -> None:
     path.write_text(json.dumps(rig))
     with pytest.raises(InputError, match=r"the name .* of a lens must consist of letters|rig.yaml:1:"):
         read_rig(FilePart(path))
+
+
+@pytest.mark.parametrize("name", HOSTILE_NAMES + LONG_NAMES)
+def test_hostile_names_of_a_house_are_refused(tmp_path: Path, name: str) -> None:
+    """Pictures of a page are found by the names of the panoramas."""
+    row = {"name": name, "placed_by": "links", "part": 0, "group": None, "scale": 1.0, "center": [0, 0, 0],
+           "rotation": np.eye(3).tolist(), "center_std": None, "turn_std_deg": None, "links": []}  # fmt: skip
+    path = tmp_path / "house.json"
+    path.write_text(json.dumps({"camera_height": 1.5, "panoramas": [row]}))
+    with pytest.raises(InputError, match=r"house\.json"):
+        read_house(path)

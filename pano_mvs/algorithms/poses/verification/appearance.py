@@ -61,7 +61,7 @@ class Surroundings:
         colors = np.concatenate([np.zeros((0, 3), np.float32), *(colors for _, colors in sources)])
         if not len(points):
             return Appearance()
-        expected, known = _seen(pose, points, colors, small.mask.shape)
+        expected, known = _seen(pose, points, colors, shape=small.mask.shape)
         known &= small.mask
         shown = self._colors(image)
         area = np.broadcast_to(pixel_solid_angle(known.shape)[:, None], known.shape)
@@ -82,7 +82,7 @@ class Surroundings:
 
 
 def _seen(
-    pose: Rigid3, points: FloatArray, colors: NDArray[np.float32], shape: tuple[int, ...]
+    pose: Rigid3, points: FloatArray, colors: NDArray[np.float32], *, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the colours of points (P, 3) that a camera at a pose sees, (H, W, 3), and where it sees any."""
     height, width = shape
