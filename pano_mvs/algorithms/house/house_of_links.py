@@ -70,10 +70,11 @@ def house_of_links(
     """
     ups = up_in_cam or {}
     groups = split_groups(poses) if poses.names else []
+    is_tour = any(link.direction_deg is not None for own in links.values() for link in own)
     levelled = [
         _of_group(with_cameras(group, np.isin(group.names, names)), number)
         for number, group in enumerate(groups)
-        for names in _certain(group)
+        for names in (_certain(group) if is_tour else [group.names])
     ]
     levelled.sort(key=lambda one: -len(one.part.cameras))
     grouped = {name for one in levelled for name in one.part.cameras}
@@ -85,8 +86,9 @@ def house_of_links(
     between = any(link.parts[0] != link.parts[1] for link in part_links(parts, links))
     if between:
         parts = [_with_walls(part, pictures) for part in parts]
-    used = part_links(parts, links) if between else []
-    places = layout(parts, used, rng=np.random.default_rng(0)) if parts else []
+        places = layout(parts, part_links(parts, links), rng=np.random.default_rng(0))
+    else:
+        places = [Place(np.zeros(2), 0.0, _scale(part), 0.0, 0.0) for part in parts[:1]] + [None] * len(parts[1:])
     return _house(levelled, places, links, order=tuple(pictures))
 
 
@@ -97,8 +99,13 @@ def _certain(group: Poses) -> list[list[str]]:
         (len(group.names), len(group.points_in_world)),
     ).tocsr()
     certain = np.array([name not in group.doubts for name in group.names], np.bool_)
-    shared = (seen @ seen.T).toarray() >= (_SHARED_POINTS if len(group.points_in_world) else 0)
-    labels = connected_components(shared & certain & certain[:, None], directed=False)[1]
+    shared = coo_array(seen @ seen.T)
+    joins = (shared.data >= _SHARED_POINTS) & certain[shared.row] & certain[shared.col]
+    ends = np.stack([shared.row[joins], shared.col[joins]]).astype(np.intp)
+    if not len(group.points_in_world):  # poses from a file: nothing speaks against their connection
+        ends = np.stack([np.flatnonzero(certain)[:-1], np.flatnonzero(certain)[1:]])
+    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(certain), len(certain)))
+    labels = connected_components(graph, directed=False)[1]
     parts = [np.flatnonzero(certain & (labels == label)) for label in np.unique(labels[certain])]
     parts.sort(key=lambda part: (-len(part), int(part[0])))
     return [[group.names[idx] for idx in part] for part in parts if len(part) > 1]
@@ -147,7 +154,7 @@ def _house(
         if not number and one.part.is_single and not joined:
             by = PlacedBy.NOTHING
         if place is None:
-            scale = 1.0 if one.part.is_single else 1 / one.part.height if np.isfinite(one.part.height) else first.scale
+            scale = _scale(one.part)
             beside = Place(np.zeros(2), 0.0, scale, np.inf, np.inf)
             left = -_reach(one.part, beside, sign=-1)
             place = Place(np.array([right + _BESIDE + left, 0.0]), 0.0, scale, np.inf, np.inf)
@@ -188,6 +195,11 @@ def _of_rows(
         links=tuple(tuple(link.name for link in links.get(name, ()) if link.name in names) for name in names),
         camera_height=camera_height,
     )
+
+
+def _scale(part: Part) -> float:
+    """Return the unit of a part in camera heights; 1 if its height above the floor is not known."""
+    return 1 / part.height if not part.is_single and np.isfinite(part.height) else 1.0
 
 
 def _reach(part: Part, place: Place, *, sign: int = 1) -> float:
