@@ -96,9 +96,9 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
         if mesh is not None:
             nearest = _nearest_cameras(mesh.vertices, group)
             for move, cameras in _by_move(moves):
-                inside = np.isin(nearest, cameras)[mesh.faces].all(axis=1)
+                inside = np.asarray(np.isin(nearest, cameras)[mesh.faces].all(axis=1))
                 if inside.any():
-                    meshes.append(replace(mesh, faces=mesh.faces[inside]).moved(move))
+                    meshes.append(_some_faces(mesh, inside).moved(move))
     count = sum(by == PlacedBy.LINKS for by in house.placed_by)
     notes.append(
         f"links of the tour say where {count} of {len(house.names)} panoramas {plural(count, 'is', 'are')}; their "
@@ -153,6 +153,18 @@ def _by_move(moves: Sequence[tuple[int, Similarity3] | None]) -> Iterator[tuple[
 def _nearest_cameras(points: NDArray[np.float32], group: Poses) -> NDArray[np.intp]:
     """Return the position of the camera nearest to each point (P, 3): what it saw moves with it."""
     return np.asarray(cKDTree(group.centers).query(points)[1], np.intp)
+
+
+def _some_faces(mesh: SharedMesh, chosen: NDArray[np.bool_]) -> SharedMesh:
+    """Return some faces of a mesh with the vertices that they use: others would move to where nothing is."""
+    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    return replace(
+        mesh,
+        vertices=mesh.vertices[used],
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        colors_rgb=None if mesh.colors_rgb is None else mesh.colors_rgb[used],
+        uv=None if mesh.uv is None else mesh.uv[used],
+    )
 
 
 def _moved(cloud: PointCloud, into_house: Similarity3) -> PointCloud:

@@ -15,7 +15,7 @@ from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.scene import House
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.share import share_run
-from pano_mvs.share.mesh_file import SharedMesh, joined_meshes
+from pano_mvs.share.mesh_file import SharedMesh, joined_meshes, run_mesh
 from pano_mvs.share.share import page_from_world
 from pano_mvs.share.shown import shown_of
 from tests.share.box_run import NAMES, box_run
@@ -92,6 +92,16 @@ def test_what_doubtful_cameras_saw_is_not_shown_and_a_part_moves_as_a_whole(tmp_
     assert before is not None
     assert len(moved.cloud) == alone.points
     assert np.median(moved.cloud.points_in_world[:, 0]) > 45.0
+
+
+def test_a_mesh_keeps_what_certain_cameras_saw(tmp_path: Path) -> None:
+    run, _ = with_house(box_run(tmp_path, points=2_000, mesh=True), tmp_path / "images")
+    whole, _ = run_mesh(run)
+    mesh = shown_of(run, with_mesh=True).mesh
+    assert whole is not None
+    assert mesh is not None
+    assert 0 < len(mesh.faces) < len(whole.faces)
+    assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices))), "vertices that no face uses are gone"
 
 
 def test_the_unit_is_that_of_the_largest_part(tmp_path: Path) -> None:
