@@ -79,11 +79,22 @@ _HOMES = {
 }
 
 
+# The group of the entry points by which plugins add names to this module.
+FUNCTIONS_GROUP = "pano_mvs.functions"
+
+
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    if not name.startswith("_"):
+        from pano_mvs.core.doors import installed, load_entry
+
+        for entry in installed(FUNCTIONS_GROUP).get(name, ())[:1]:
+            return load_entry(entry)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES})
+    from pano_mvs.core.doors import installed
+
+    return sorted({*globals(), *_HOMES, *installed(FUNCTIONS_GROUP)})

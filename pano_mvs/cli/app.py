@@ -10,7 +10,8 @@ import faulthandler
 import os
 import shlex
 import sys
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +22,7 @@ from rich.markup import escape
 from pano_mvs import __version__
 from pano_mvs.cli.cache_commands import cache_app
 from pano_mvs.cli.calibrate_command import calibrate
+from pano_mvs.cli.commands import PluginGroup, load_files, takes_options
 from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
@@ -41,11 +43,13 @@ from pano_mvs.cli.options import (
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
+from pano_mvs.core.doors import RunOption
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
     name="pano-mvs",
+    cls=PluginGroup,
     help="Dense 3D from 360° photographs.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -92,8 +96,8 @@ class RunArguments:
         str,
         _worker_option(
             "--executor",
-            help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
-            "serial (one unit at a time in this process, for debugging). Default: processes.",
+            help="How units are computed: processes, serial (one unit at a time in this process, for debugging), or "
+            "an executor of a plugin, such as dask or slurm. Default: processes.",
             show_default=False,
         ),
     ] = ""
@@ -104,35 +108,6 @@ class RunArguments:
     threads: Annotated[
         int, _worker_option("--threads-per-worker", min=0, help="Threads per worker; 0: an equal share of the cores.")
     ] = 0
-    scheduler: Annotated[
-        str,
-        _worker_option(
-            "--scheduler",
-            metavar="ADDRESS",
-            help="Use this dask scheduler, such as tcp://host:8786; its workers must share the cache.",
-            show_default=False,
-        ),
-    ] = ""
-    queue: Annotated[
-        Path | None,
-        _worker_option(
-            "--queue",
-            metavar="FILE.yaml",
-            help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
-            show_default=False,
-        ),
-    ] = None
-    notify: Annotated[
-        list[str] | None,
-        _disk_option(
-            "--notify",
-            metavar="URL",
-            help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
-        ),
-    ] = None
-    otel: Annotated[
-        bool, _disk_option("--otel", help="Send the run, its stages and units as spans to an OpenTelemetry collector.")
-    ] = False
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False
     until: UntilOption = None
     only: OnlyOption = None
@@ -191,15 +166,25 @@ class RunArguments:
     ] = None
 
 
+def _plugin_options() -> dict[str, RunOption]:
+    """Return the options that executors and observers add to `pano-mvs run`."""
+    from pano_mvs.engine.executors.choose import executor_options
+    from pano_mvs.session.observers import observer_options
+
+    load_files()
+    return {**executor_options(), **observer_options()}
+
+
 @app.command()
+@takes_options(_plugin_options)
 @guarded
 @takes_record
-def run(given: RunArguments) -> None:
+def run(given: RunArguments, options: Mapping[str, tuple[str, ...]] | None = None) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import run_decided
-    from pano_mvs.cli.run.command import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.merging.block_runs import decision_of
+    from pano_mvs.session.observers import OBSERVERS, observing
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
@@ -213,17 +198,27 @@ def run(given: RunArguments) -> None:
         out=given.out,
         run_options=run_options,
     )
-    execution = Execution(**{field.name: getattr(given, field.name) for field in fields(Execution)})
-    decision = decision_of(
-        session,
-        execution,
-        given.block_size,
-        overlap=given.block_overlap,
-        loop=given.block_loop,
-        poses=given.block_poses,
+    observers = {name: values for name, values in (options or {}).items() if name in OBSERVERS.names()}
+    execution = Execution(
+        given.executor,
+        given.workers,
+        given.threads,
+        options={name: values[0] for name, values in (options or {}).items() if name not in observers},
+        min_free=given.min_free,
+        durable=given.durable,
     )
-    with notified([] if given.dry_run else given.notify or [], session.out):
-        raise typer.Exit(run_decided(session, execution, decision, as_json=given.as_json, dry_run=given.dry_run))
+    with observing({} if given.dry_run else observers, session.out) as observed:
+        execution = replace(execution, observers=observed)
+        decision = decision_of(
+            session,
+            execution,
+            given.block_size,
+            overlap=given.block_overlap,
+            loop=given.block_loop,
+            poses=given.block_poses,
+        )
+        code = run_decided(session, execution, decision, as_json=given.as_json, dry_run=given.dry_run)
+    raise typer.Exit(code)
 
 
 @app.command()
@@ -312,6 +307,8 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
     from pano_mvs.session.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
+    for reason in session.workflow.left_out:
+        Console(stderr=True).say(f"[yellow]warning:[/] {escape(reason)}")
     count = len(session.workflow.stages)
     Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
 
@@ -383,15 +380,6 @@ def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.
     from pano_mvs.cli.page_commands import rewrite_report
 
     rewrite_report(out, cache, Console())
-
-
-@app.command("crate")
-@guarded
-def describe_run(out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")]) -> None:
-    """Describe a run as an RO-Crate: software, settings, and digests of inputs and outputs, for an archive."""
-    from pano_mvs.results.crate import write_crate
-
-    Console().say(escape(f"{write_crate(out)} is written"))
 
 
 app.command()(plugins)

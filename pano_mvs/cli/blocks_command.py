@@ -87,7 +87,8 @@ def _run_blocks_shown(
 
     with interrupted_by_termination():
         merge = partial(_merge, session=session, console=console)
-        code = run_blocks(session, decision, run_block=run_block, merge=merge, progress=partial(_print_event, console))
+        progress = execution.observed(partial(_print_event, console))
+        code = run_blocks(session, decision, run_block=run_block, merge=merge, progress=progress)
     early = [name for name, ended in codes.items() if is_early(ended)]
     if early and session.run_options.keep_going:
         console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")

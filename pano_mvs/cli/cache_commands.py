@@ -1,20 +1,18 @@
-"""`pano-mvs cache`: size, content and integrity of a cache, results that can be deleted, and copies of a cache."""
+"""`pano-mvs cache`: size, content and integrity of a cache, and results that can be deleted."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
+from pano_mvs.cli.commands import PluginGroup
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.options import CacheOption
@@ -24,11 +22,12 @@ from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.core.text import plural
 
 if TYPE_CHECKING:  # a command loads what it needs itself
-    from pano_mvs.engine.cache.remote import Copied
     from pano_mvs.engine.cache.store import Store
 
 cache_app = typer.Typer(
-    help="Inspect and clean the cache. Only `gc --delete` and `verify` delete files.", no_args_is_help=True
+    cls=PluginGroup,
+    help="Inspect and clean the cache. Only `gc --delete` and `verify` delete files.",
+    no_args_is_help=True,
 )
 
 
@@ -142,57 +141,6 @@ def _seconds(text: str) -> float:
     if match is None:
         raise UsageError(f"{text!r} is not a duration: write a number and s, m, h, d or w, such as 30d")
     return float(match[1]) * {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}[match[2]]
-
-
-@cache_app.command("push")
-@guarded
-def push(
-    url: Annotated[str, typer.Argument(help="Folder, or URL such as s3://bucket/cache or ssh://host/folder.")],
-    cache: CacheOption = None,
-) -> None:
-    """Copy results to another place, from which `cache pull` fetches them; what is there is not copied again.
-
-    Every file is checked against its digest first.
-    """
-    from pano_mvs.engine.cache.remote import RemoteCache
-
-    store, console = open_cache(cache), Console()
-    with _copying(console) as progress:
-        copied = RemoteCache(url).push(store, progress)
-    _print_copied(copied, url, console)
-
-
-@cache_app.command("pull")
-@guarded
-def pull(
-    url: Annotated[str, typer.Argument(help="Folder or URL that `cache push` has written.")],
-    cache: CacheOption = None,
-) -> None:
-    """Copy results from another place into the cache, so that a run of the same images goes on with them.
-
-    Every file is checked against its digest; damaged ones are refused.
-    """
-    from pano_mvs.engine.cache.remote import RemoteCache
-    from pano_mvs.engine.cache.store import Store
-
-    root, remote, console = cache_root(cache), RemoteCache(url), Console()
-    with _copying(console) as progress:
-        copied = remote.pull(Store(root), progress)
-    _print_copied(copied, str(root), console)
-
-
-@contextmanager
-def _copying(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar, and yield what moves it."""
-    columns = TextColumn("copying"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as bars:
-        bar = bars.add_task("copying", total=None)
-        yield lambda done, total: bars.update(bar, completed=done, total=total)
-
-
-def _print_copied(copied: Copied, to: str, console: Console) -> None:
-    files = f"{copied.files} {plural(copied.files, 'file')}, {size_text(copied.size_bytes)}"
-    console.say(f"copied to {escape(to)}: {files}; {copied.present} were there already")
 
 
 @cache_app.command("pin")

@@ -6,21 +6,23 @@ import inspect
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar, get_type_hints
+from typing import Annotated, get_type_hints
 
 import typer
 
 from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
 
-Arguments = TypeVar("Arguments")
 
+def takes_record(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command with many options take them as one record, whose fields typer reads as those of a function.
 
-def takes_record(command: Callable[[Arguments], None]) -> Callable[..., None]:
-    """Let a command with many options take them as one record, whose fields typer reads as those of a function."""
-    (record,) = (hint for name, hint in get_type_hints(command).items() if name != "return")
+    The record is the command's first argument; others are passed on.
+    """
+    record = next(iter(get_type_hints(command).values()))
+    own = inspect.signature(record).parameters.keys()
 
     def take(**values: object) -> None:
-        command(record(**values))
+        command(record(**{name: values.pop(name) for name in own}), **values)
 
     take.__name__, take.__doc__ = command.__name__, command.__doc__
     take.__annotations__ = hints = get_type_hints(record, include_extras=True)

@@ -21,7 +21,7 @@ from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
 from pano_mvs.core.yaml_text import Located
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.executors.queues import read_queue
+from pano_mvs.engine.executors.choose import executor_size
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit, UnitInput
@@ -43,12 +43,8 @@ def show_dry_run(session: Session, console: Console, *, execution: Execution, as
     if as_json:
         raise UsageError("--dry-run prints a table, not events: leave out --json")
     check_output(session)
-    workers, threads = 1 if execution.executor == "serial" else execution.workers, execution.threads
-    if execution.queue is not None:
-        queue = read_queue(execution.queue)
-        places, threads = queue.shape(threads)
-        workers = places * queue.jobs
-    show_plan(session, console, workers=workers, threads=threads)
+    size = executor_size(execution.request)
+    show_plan(session, console, workers=size.workers, threads=size.threads)
 
 
 def show_plan(session: Session, console: Console, *, workers: int = 0, threads: int = 0) -> RunPlan:

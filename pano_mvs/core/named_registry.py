@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from inspect import unwrap
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any, Generic, TypeVar
 
 from pano_mvs.core.errors import PluginError, UsageError
@@ -31,7 +33,7 @@ class NamedRegistry(Generic[Value]):
     def __init__(self, kind: str, builtin: Mapping[str, Value]) -> None:
         self.kind = kind
         self._builtin = dict(builtin)
-        self._added: dict[str, tuple[Value, Callable[..., Any]]] = {}
+        self._added: dict[str, tuple[Value, CodeType]] = {}
 
     def names(self) -> tuple[str, ...]:
         """Return all names, the built-in ones first."""
@@ -43,7 +45,7 @@ class NamedRegistry(Generic[Value]):
         Args:
             name: letters, digits, '-', '_' and '.'.
             value: what `get` returns.
-            function: the plugin's function behind the value; its file counts as the code of the value.
+            function: the plugin's function or class behind the value; its file counts as the code of the value.
 
         Raises:
             PluginError: if the name has other characters, or is that of a built-in value.
@@ -52,8 +54,8 @@ class NamedRegistry(Generic[Value]):
             raise PluginError(f"a {self.kind} cannot be called {name!r}: use letters, digits, '-', '_' and '.'")
         if name in self._builtin:
             raise PluginError(f"the {self.kind} {name!r} is built in: register yours under another name")
-        self._added[name] = value, function
-        code = function.__code__
+        code = _code_of(function)
+        self._added[name] = value, code
         registration = Registration(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
         setattr(function, _ATTRIBUTE, (*registrations_of(function), registration))
 
@@ -83,7 +85,18 @@ class NamedRegistry(Generic[Value]):
 
     def code_file(self, name: str) -> Path | None:
         """Return the plugin file behind a name, or None if the value is built in."""
-        return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
+        return Path(self._added[name][1].co_filename) if name in self._added else None
+
+
+def _code_of(function: Callable[..., Any]) -> CodeType:
+    """Return the code of a function, of one that is wrapped, or of a class's first method."""
+    inner = unwrap(function)
+    if isinstance(inner, type):
+        inner = next((method for method in vars(inner).values() if isinstance(method, FunctionType)), inner)
+    code = getattr(inner, "__code__", None)
+    if not isinstance(code, CodeType):
+        raise PluginError(f"{function!r} cannot be registered: it is neither a function nor a class with methods")
+    return code
 
 
 def set_unavailable(reasons: Mapping[tuple[str, str], str], broken: Sequence[str]) -> None:

@@ -25,6 +25,7 @@ from pano_mvs.session.merging.block_runs import (
     remember_division,
 )
 from pano_mvs.session.merging.merge import merge_outputs
+from pano_mvs.session.observers import observing
 from pano_mvs.session.progress import BlockStarted, Divided, EventLog, Progress, RunFinished
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution, run_session
@@ -46,6 +47,7 @@ def run(
     refresh: Sequence[str] = (),
     keep_going: bool = False,
     progress: Progress | None = None,
+    observers: Mapping[str, Sequence[str]] | None = None,
     block_size: int | None = None,
     block_overlap: int = 0,
     block_loop: bool = False,
@@ -72,14 +74,16 @@ def run(
         settings: `STAGE.PARAM` to a Python value, or to a string in the syntax of `--set`.
         cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
             current folder if the workflow is a preset).
-        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`; or an `Execution`, for
-            other settings, such as a queueing system.
+        executor: `processes` (the default), `serial` (in this process, for debugging) or that of a plugin, such as
+            `dask`; or an `Execution`, for other settings, such as those of a queueing system.
         workers: number of units at a time; None for one per core, if memory permits.
         until: run only these stages and those that they need.
         only: run only these units, as `STAGE:ITEM`, and those that they need.
         refresh: stages or units to recompute even if they are cached.
         keep_going: continue after failures even if a stage has `on_error: stop`.
         progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
+        observers: name of each observer of a plugin that is to receive the events, to the values of its option, such
+            as `{"otel": (), "notify": ["ntfy://topic"]}`.
         block_size: run overlapping blocks of at most this number of images, and merge them; 0 to run all images at
             once. None: in blocks if pairs or poses would take more memory than there is. If the run of a block ends
             early, its output is returned.
@@ -106,11 +110,14 @@ def run(
     poses = None if block_poses is None else Path(block_poses)
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=poses)
     progress = progress or ignore
-    if decision.division is not None:
-        return run_in_blocks(session, execution, decision, progress=progress)
-    if decision.reason:
-        progress(Warned(decision.reason))
-    return run_session(session, execution, progress)
+    wanted = {name: tuple(values) for name, values in (observers or {}).items()}
+    with observing(wanted, session.out) as observed:
+        execution = replace(execution, observers=observed)
+        if decision.division is not None:
+            return run_in_blocks(session, execution, decision, progress=progress)
+        if decision.reason:
+            progress(Warned(decision.reason))
+        return run_session(session, execution, progress)
 
 
 def run_in_blocks(session: Session, execution: Execution, decision: BlockDecision, *, progress: Progress) -> RunOutput:
@@ -135,7 +142,7 @@ def run_in_blocks(session: Session, execution: Execution, decision: BlockDecisio
     def merge(outs: Sequence[Path]) -> int:
         return merge_outputs(outs, session.out, cache=session.store_root).summary.exit_code
 
-    run_blocks(session, decision, run_block=run_block, merge=merge, progress=progress)
+    run_blocks(session, decision, run_block=run_block, merge=merge, progress=execution.observed(progress))
     early = [output for output in outputs if is_early(output.summary.exit_code)]
     return early[0] if early else load(session.out, cache=session.store_root)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.core.paths import exists, is_file
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
-from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors.choose import ExecutorRequest, make_executor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.engine.running.output_lock import output_lock
@@ -30,10 +30,10 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.session.observers import Observers
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted
 from pano_mvs.session.session import Session, check_output
-from pano_mvs.session.spans import Spans
 from pano_mvs.session.summarise import chain_of, latest, summarise
 from pano_mvs.session.time_estimator import EventObserver
 
@@ -44,18 +44,25 @@ MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 class Execution:
     """How the units of a run are computed."""
 
-    # `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by the other
-    # settings and this machine
-    executor: str = ""
+    executor: str = ""  # name of a built-in executor or of a plugin's; empty to choose by the other settings
     workers: int = 0  # number of units at a time; 0 for one per core, if memory permits
     threads: int = 0  # of each worker; 0 for an equal share of the cores
-    scheduler: str = ""  # address of a dask scheduler
-    queue: Path | None = None  # YAML file with the settings of jobs, for a queueing system
+    # of the executor: the option of `pano-mvs run` without its dashes to its value, such as `queue` to a file
+    options: Mapping[str, str] = field(default_factory=dict)
     # free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value of
     # $PANO_MVS_MIN_FREE, or else 200 MB
     min_free: str = ""
     durable: bool = False  # whether to flush every result to disk
-    otel: bool = False  # whether to send the run, its stages and units as spans to an OpenTelemetry collector
+    observers: Observers | None = None  # receive the events of the run, as `observing` makes them
+
+    @property
+    def request(self) -> ExecutorRequest:
+        """What the run asks of its executor."""
+        return ExecutorRequest(self.executor, self.workers, self.threads, self.options)
+
+    def observed(self, progress: Progress) -> Progress:
+        """Return a callback that passes events on, and to the observers."""
+        return progress if self.observers is None else self.observers.beside(progress)
 
 
 def _check_not_merged(out: Path) -> None:
@@ -81,25 +88,24 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
                 set_aside(path)
     min_free = min_free_bytes(execution.min_free)
     store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)
-    executor = make_executor(
-        store,
-        execution.executor,
-        workers=execution.workers,
-        threads=execution.threads,
-        scheduler=execution.scheduler,
-        queue=execution.queue,
-    )
+    executor = make_executor(store, execution.request)
     try:
-        return _run_and_report(session, store, executor, progress=progress, otel=execution.otel)
+        log = EventLog(progress)
+        return _run_and_report(session, store, executor, log=log, report=execution.observed(log))
     finally:
         executor.close()
 
 
-def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress, otel: bool) -> RunOutput:
-    """Run, and report the first and the last event."""
+def _run_and_report(
+    session: Session, store: Store, executor: Executor, *, log: EventLog, report: Progress
+) -> RunOutput:
+    """Run, and report the first and the last event.
+
+    Args:
+        log: writes events into the output folder once it is open.
+        report: passes events on to the log, and to observers.
+    """
     clock = time.perf_counter()
-    log = EventLog(progress)
-    report = Spans(log) if otel else log
     observer = EventObserver(report, executor=executor)
     observer(
         RunStarted(
@@ -126,6 +132,8 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         )
         with output_lock(session.out):
             log.open(session.out)
+            for reason in session.workflow.left_out:
+                observer(Warned(reason))
             if (forecast := forecast_run(run)) is not None:
                 observer(forecast)
             summary, values = _execute(run, started, clock)

@@ -13,12 +13,12 @@ import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
-from pano_mvs.engine.stages.params import Params, files_of
+from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
-from pano_mvs.io.images.captures import UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES, unstitched_reason
-from pano_mvs.io.images.tours import is_tour
+from pano_mvs.io.images.captures import UNSTITCHED_SUFFIXES, unstitched_reason
+from pano_mvs.io.readers import capture_reader_of
 from pano_mvs.results.summary import CACHE_VARIABLE, RunSummary, cache_of
 
 
@@ -34,7 +34,7 @@ class Session:
     run_options: RunOptions = DEFAULT_OPTIONS
 
 
-_FOLDER_SOURCE, _VIDEO_SOURCE, _TOUR_SOURCE = "source.folder", "source.video", "source.tour"
+_FOLDER_SOURCE = "source.folder"
 
 
 def presets_folder() -> Path:
@@ -53,7 +53,7 @@ def _images_mistake(images: Path) -> str:
         return f"--images {images}: {denied}"
     if images.suffix.lower() in UNSTITCHED_SUFFIXES:
         return f"--images {images}: this is {unstitched_reason(images)}"
-    if images.suffix.lower() not in VIDEO_SUFFIXES:
+    if capture_reader_of(images) is None:
         return f"--images {images}: this is a file; give the folder that contains the images, or a video"
     return ""
 
@@ -69,8 +69,8 @@ def open_session(
 ) -> Session:
     """Find, validate and wire a workflow.
 
-    If `images` holds a virtual tour, source.tour takes the place of source.folder with the settings that both have,
-    unless `overrides` name a source.
+    If `images` holds another kind of capture that a plugin reads, such as a virtual tour, its source takes the place of
+    source.folder with the settings that both have, unless `overrides` name a source.
 
     The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
     preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
@@ -98,14 +98,8 @@ def open_session(
         raise WorkflowError([*([mistake] if mistake else []), *others]) from None
     if mistake:
         raise InputError(mistake)
-    if images is not None and not is_folder(images) and workflow.stages["images"].spec.name != _VIDEO_SOURCE:
-        raise InputError(
-            f"--images {images}: this is a video. Use the preset walk, or "
-            f"--set images.use={_VIDEO_SOURCE} --set pairs.use=pairs.sequential"
-        )
-    chosen = any(override.partition("=")[0].strip() == "images.use" for override in overrides)
-    if images is not None and not chosen and workflow.stages["images"].spec.name == _FOLDER_SOURCE and is_tour(images):
-        overrides = [*_tour_overrides(workflow.stages["images"].params, registry), *overrides]
+    if images is not None and (added := _source_overrides(images, workflow, registry, overrides=overrides)):
+        overrides = [*added, *overrides]
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     # The files of the user's plugin folder go along to the workers as well, which need not have it.
     named = {resolved(path) for path in workflow.plugins}
@@ -126,12 +120,29 @@ def open_session(
     return session
 
 
-def _tour_overrides(params: Params, registry: Registry) -> list[str]:
-    """Return what makes source.tour the stage of images, with the settings of source.folder that it has as well."""
-    shared = registry.stages[_TOUR_SOURCE].params_type.model_fields.keys() & type(params).model_fields.keys() - {"path"}
+def _source_overrides(images: Path, workflow: Workflow, registry: Registry, *, overrides: Sequence[str]) -> list[str]:
+    """Return what makes the source that reads a capture the stage of images, with the settings that both have.
+
+    Nothing is needed for a folder of panoramas, or if the workflow or an override names a source.
+
+    Raises:
+        InputError: if the workflow needs more than another source.
+    """
+    entry, reader = workflow.stages["images"], capture_reader_of(images)
+    if reader is None or reader.source == entry.spec.name:
+        return []
+    if reader.advice:
+        if is_folder(images):
+            return []
+        raise InputError(f"--images {images}: this is {reader.what}. {reader.advice}")
+    chosen = any(override.partition("=")[0].strip() == "images.use" for override in overrides)
+    spec = registry.stages.get(reader.source)
+    if chosen or spec is None or entry.spec.name != _FOLDER_SOURCE:
+        return []
+    shared = spec.params_type.model_fields.keys() & type(entry.params).model_fields.keys() - {"path"}
     return [
-        f"images.use={_TOUR_SOURCE}",
-        *(f"images.{name}={json.dumps(getattr(params, name))}" for name in sorted(shared)),
+        f"images.use={reader.source}",
+        *(f"images.{name}={json.dumps(getattr(entry.params, name))}" for name in sorted(shared)),
     ]
 
 

@@ -11,7 +11,6 @@ from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh, mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
-from pano_mvs.stages.exports.tour import panoramas, tour_of_panoramas
 from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -33,7 +32,6 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
-from pano_mvs.stages.house import house_file, links
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge
 from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad
@@ -41,6 +39,5 @@ from pano_mvs.stages.poses import from_model, refine, scaled_translation, triang
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.rigs import colmap_lenses, dual_fisheye
-from pano_mvs.stages.source import folder, tour
-from pano_mvs.stages.source_video import video
+from pano_mvs.stages.source import folder
 from pano_mvs.stages.weak_images import weak

@@ -28,8 +28,8 @@ from pano_mvs.geometry import PinholeView, Rigid3, ray_grid, rotation_from_rotve
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
-from tests.io.images.tours import face_of
 from tests.oracles.surfaces import z_depth as slow_z_depth
+from tests.synthetic.tour_files import face_of
 
 View = tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]
 

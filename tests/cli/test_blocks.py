@@ -16,6 +16,8 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
+from pano_mvs.engine.executors.choose import EXECUTORS, ExecutorKind, ExecutorRequest, ExecutorSize
+from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.running.events import Warned
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import key_fields
@@ -113,7 +115,7 @@ def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         whole=True,
     )
     assert unit is not None
-    limit = "pano_mvs.session.merging.block_runs.total_memory_bytes"
+    limit = "pano_mvs.engine.executors.choose.total_memory_bytes"
     monkeypatch.setattr(limit, lambda: int(12 * unit.stored_bytes) + 1)
 
 
@@ -307,7 +309,7 @@ def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
 def test_even_small_blocks_may_not_fit(
     pano_mvs: Command, runs: Runs, walk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pano_mvs.session.merging.block_runs.total_memory_bytes", lambda: 1)
+    monkeypatch.setattr("pano_mvs.engine.executors.choose.total_memory_bytes", lambda: 1)
     runs.ends["out"] = STOPPED
     result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
     assert "even that of blocks of 7 images would not do" in result.flat
@@ -315,13 +317,21 @@ def test_even_small_blocks_may_not_fit(
 
 
 @pytest.mark.usefixtures("small_memory")
-def test_the_memory_of_workers_counts(pano_mvs: Command, runs: Runs, walk: Path) -> None:
-    command = ("run", "quickstart", "--images", walk, "--out", "out")
+@pytest.mark.parametrize("memory_bytes", [0, 64_000_000_000])
+def test_the_memory_of_workers_counts(
+    pano_mvs: Command, runs: Runs, walk: Path, memory_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is that of a job, or unknown, as with the workers of a scheduler."""
+    kind = ExecutorKind(_not_started, size=lambda _request: ExecutorSize(2, 1, memory_bytes))
+    monkeypatch.setitem(EXECUTORS._builtin, "elsewhere", kind)
     runs.ends["out"] = STOPPED
-    assert "blocks" not in pano_mvs(*command, "--scheduler", "tcp://nowhere:1").text
-    Path("queue.yaml").write_text("{cores: 8, memory: 64GB, walltime: '04:00:00', jobs: 2}", encoding="utf-8")
-    assert "blocks" not in pano_mvs(*command, "--executor", "slurm", "--queue", "queue.yaml").text
+    command = ("run", "quickstart", "--images", walk, "--out", "out", "--executor", "elsewhere")
+    assert "blocks" not in pano_mvs(*command).text
     assert [*runs.seen] == ["out"]
+
+
+def _not_started(_store: Store, _request: ExecutorRequest) -> Executor:
+    raise AssertionError("the run itself is replaced")
 
 
 def test_events_of_all_blocks_are_printed(pano_mvs: Command, runs: Runs, walk: Path) -> None:

@@ -21,7 +21,7 @@ import pano_mvs as installed
 from pano_mvs.testing.tiny_capture import tiny_capture
 from tests.cli.conftest import Command, run_json
 from tests.io.images.pictures import app1, exif
-from tests.io.images.videos import counted, write_video
+from tests.synthetic.video_files import counted, write_video
 
 LOOK = "pano_mvs: 1\nstages: {images: {use: source.folder, path: photos}}\n"
 FILM = """

@@ -12,16 +12,15 @@ from typing import Any
 
 import pytest
 from typer.core import TyperOption
-from typer.main import get_command
 
 import pano_mvs
-from pano_mvs.cli.app import app
 from pano_mvs.core.yaml_text import MAX_DEPTH, MAX_VALUES
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow_file import MAX_BYTES, MAX_FILES, MAX_STAGES
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.scene import Poses
+from tests.cli.command_tree import all_commands
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -94,15 +93,10 @@ def prose(page: Path) -> str:
     return FENCED.sub("", page.read_text(encoding="utf-8")).replace("\n", " ")
 
 
-def commands(command: Any, words: str = "") -> dict[str, dict[str, TyperOption]]:
-    """Return the options of each command below one, by name."""
-    known = {name: option for option in command.params for name in (*option.opts, *option.secondary_opts)}
-    inner = getattr(command, "commands", {})
-    below = [commands(child, f"{words} {name}".strip()) for name, child in inner.items()]
-    return {words: known, **{name: options for one in below for name, options in one.items()}}
-
-
-COMMANDS = commands(get_command(app))
+COMMANDS: dict[str, dict[str, TyperOption]] = {
+    " ".join(words): {name: option for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    for words, command in all_commands()
+}
 TABLES = {"running": "run", "large_captures": "run"}
 """Page to the command whose options its tables list."""
 

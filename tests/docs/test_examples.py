@@ -24,8 +24,8 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from tests.algorithms.learned.grey_network import GREY_NETWORK
-from tests.io.images.tours import write_tour
-from tests.io.images.videos import tiny_video
+from tests.synthetic.tour_files import write_tour
+from tests.synthetic.video_files import tiny_video
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])

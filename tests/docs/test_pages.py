@@ -22,14 +22,13 @@ from pano_mvs.io.rig_calibration import MODELS, read_rig
 from pano_mvs.scene import FilePart
 from pano_mvs.stages.frame import ScaleParams
 from pano_mvs.stages.rigs import DualFisheyeParams
-from pano_mvs.stages.source_video import VideoParams
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Command, run_json
 from tests.docs.pages import ROOT, block, copy_plugin, text_of
-from tests.io.images.videos import write_video
 from tests.stored import read_picture
 from tests.synthetic.capture_files import write_capture
+from tests.synthetic.video_files import write_video
 
 LevelParams = Registry.installed().stages["poses.level"].params_type
 
@@ -92,7 +91,7 @@ def test_the_commands_for_a_folder_of_videos_run(preset: str, last: str, pano_mv
 
 
 def test_all_settings_and_kinds_are_told() -> None:
-    assert all(f"`{name}`" in INPUT for name in VideoParams.model_fields)
+    assert all(f"`{name}`" in INPUT for name in Registry.installed().stages["source.video"].params_type.model_fields)
     assert all(f"`{suffix.lstrip('.')}`" in INPUT for suffix in VIDEO_SUFFIXES)
     told = INPUT.lower()
     assert all(suffix.lstrip(".").replace("jpg", "jpeg").replace("heif", "heic") in told for suffix in PICTURE_SUFFIXES)

@@ -204,8 +204,8 @@ def test_errors_name_arguments_and_not_options(toy: Toy) -> None:
 
 def test_execution_takes_the_place_of_the_name_of_an_executor(toy: Toy) -> None:
     assert run_toy(toy, executor=Execution("serial", threads=3)).summary.executor["threads"] == 3
-    with pytest.raises(pano_mvs.UsageError, match=r"executor=slurm requires queue=FILE\.yaml"):
-        run_toy(toy, executor=Execution("slurm"))
+    with pytest.raises(pano_mvs.UsageError, match=r"there is no executor 'nothing'; choose one of serial, processes"):
+        run_toy(toy, executor=Execution("nothing"))
 
 
 def test_only_options_become_arguments() -> None:

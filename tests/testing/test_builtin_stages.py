@@ -15,9 +15,9 @@ from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, Splat
 from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.algorithms.learned.grey_network import GREY_NETWORK
-from tests.io.images.tours import tiny_tour
-from tests.io.images.videos import tiny_video
 from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
+from tests.synthetic.tour_files import tiny_tour
+from tests.synthetic.video_files import tiny_video
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "export.floor_plan": {"formats": ["png", "svg", "dxf"]},

@@ -21,7 +21,7 @@ from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
-from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors.choose import ExecutorRequest, make_executor
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import open_session
@@ -50,7 +50,7 @@ class Patient:
     def run(self) -> RunResult:
         session = open_session(str(self.folder / "wf.yaml"), cache=self.root, out=self.out)
         store = Store(session.store_root, min_free_bytes=0)
-        executor = make_executor(store, self.executor, workers=0 if self.executor == "serial" else 2)
+        executor = make_executor(store, ExecutorRequest(self.executor, 0 if self.executor == "serial" else 2))
         try:
             return Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
         finally:

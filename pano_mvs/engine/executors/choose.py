@@ -1,18 +1,53 @@
-"""Make the executor that the command line asks for."""
+"""Make the executor that a run asks for: a built-in one, or one of a plugin."""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
-from pano_mvs.core.errors import UsageError
-from pano_mvs.core.memory import free_memory_bytes
+from pano_mvs.core.doors import Door, RunOption
+from pano_mvs.core.errors import PluginError, UsageError
+from pano_mvs.core.memory import free_memory_bytes, total_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.queues import SYSTEMS, QueueExecutor, read_queue
 from pano_mvs.engine.executors.threads import WORKER_BYTES, available_threads, share_cores
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorRequest:
+    """What a run asks of its executor."""
+
+    name: str = ""  # of the executor; one plugin may offer several that differ little
+    workers: int = 0  # number of units at a time; 0 for as many as cores and memory (3 GB each) allow
+    threads: int = 0  # threads of each worker; 0 for an equal share of the cores
+    options: Mapping[str, str] = field(default_factory=dict)  # the executor's own options, without the dashes
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorSize:
+    """How much an executor computes at a time, as `pano-mvs plan` assumes it."""
+
+    workers: int
+    threads: int  # of each worker
+    memory_bytes: int  # of one machine, for all units on it together; 0 if unknown
+
+
+def size_of_host(request: ExecutorRequest) -> ExecutorSize:
+    """Return the size of an executor on this host."""
+    workers, threads = shape(request.workers, request.threads)
+    return ExecutorSize(workers, threads, total_memory_bytes())
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorKind:
+    """An executor that users choose by `--executor NAME`."""
+
+    make: Callable[[Store, ExecutorRequest], Executor]  # the caller closes what it returns
+    options: tuple[RunOption, ...] = ()  # further options of `pano-mvs run` that belong to it
+    size: Callable[[ExecutorRequest], ExecutorSize] = size_of_host
 
 
 class SerialExecutor(Executor):
@@ -46,57 +81,119 @@ class SerialExecutor(Executor):
         """Do nothing."""
 
 
+def _serial(store: Store, request: ExecutorRequest) -> Executor:
+    if request.workers > 1:
+        raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
+    return SerialExecutor(store, threads=request.threads)
+
+
+def _processes(store: Store, request: ExecutorRequest) -> Executor:
+    workers, threads = shape(request.workers, request.threads)
+    return ProcessExecutor(store, workers=workers, threads=threads)
+
+
+def _size_of_serial(request: ExecutorRequest) -> ExecutorSize:
+    return replace(size_of_host(replace(request, workers=1)), threads=request.threads or available_threads())
+
+
+EXECUTORS = Door[ExecutorKind](
+    "executor",
+    "pano_mvs.executors",
+    {"serial": ExecutorKind(_serial, size=_size_of_serial), "processes": ExecutorKind(_processes)},
+    accepts=lambda value: value if isinstance(value, ExecutorKind) else None,
+)
 VARIABLE = "PANO_MVS_EXECUTOR"
-EXECUTORS = ("serial", "processes", "dask", *SYSTEMS)
 
 
-def make_executor(
-    store: Store, name: str = "", *, workers: int = 0, threads: int = 0, scheduler: str = "", queue: Path | None = None
-) -> Executor:
-    """Return an executor; the caller closes it.
+def register_executor(
+    name: str, *, options: tuple[RunOption, ...] = ()
+) -> Callable[[Callable[[Store, ExecutorRequest], Executor]], Callable[[Store, ExecutorRequest], Executor]]:
+    """Return a decorator that registers a function as the executor `name`, for `pano-mvs run --executor NAME`.
 
     Args:
-        name: of the executor; by default dask if a scheduler is given, else $PANO_MVS_EXECUTOR (unless a number of
-            workers is given), else processes.
-        workers: number of units at a time; 0 for as many as cores and memory (3 GB each) allow.
-        threads: threads of each worker; 0 for an equal share of the cores.
-        scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
-        queue: file with the settings of the jobs, for a queueing system.
+        options: further options of `pano-mvs run` that belong to it; their values are in `ExecutorRequest.options`.
+    """
+
+    def register(make: Callable[[Store, ExecutorRequest], Executor]) -> Callable[[Store, ExecutorRequest], Executor]:
+        EXECUTORS.register(name, ExecutorKind(make, options), make)
+        return make
+
+    return register
+
+
+def executor_options() -> dict[str, RunOption]:
+    """Return the options that executors add to `pano-mvs run`, by name; plugins that cannot be loaded have none."""
+    found: dict[str, RunOption] = {}
+    for name in EXECUTORS.names():
+        try:
+            found |= {option.name: option for option in EXECUTORS.get(name).options}
+        except PluginError:
+            continue
+    return found
+
+
+def chosen(request: ExecutorRequest) -> tuple[ExecutorKind, ExecutorRequest]:
+    """Return the executor that a run asks for, and the request with its name.
+
+    Without a name, it is the only one that has an option that is given, else $PANO_MVS_EXECUTOR (unless a number of
+    workers is given), else processes.
 
     Raises:
-        UsageError: if the arguments contradict each other, or the executor is not installed or cannot be reached.
+        UsageError: if there is none, or it has no such option.
+        PluginError: if it cannot be loaded.
     """
-    name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, "")) or "processes"
-    if name not in EXECUTORS:
-        raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS)}")
-    if scheduler and name != "dask":
-        raise UsageError(f"--scheduler requires --executor dask; {name} has no scheduler")
-    if queue is not None and name not in SYSTEMS:
-        raise UsageError(f"--queue requires --executor slurm, pbs, lsf or sge; {name} has no jobs")
-    if name in SYSTEMS:
-        if queue is None:
-            raise UsageError(f"--executor {name} requires --queue FILE.yaml; docs/running.md shows such a file")
-        if workers:
-            raise UsageError(f"--workers has no effect with --executor {name}: set `jobs` in {queue}")
-        return QueueExecutor(store, name, read_queue(queue), threads=threads)
-    if name == "serial":
-        if workers > 1:
-            raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
-        return SerialExecutor(store, threads=threads)
-    workers, threads = shape(workers, threads)
-    if name == "processes":
-        return ProcessExecutor(store, workers=workers, threads=threads)
-    from pano_mvs.engine.executors.dask_cluster import DaskExecutor
+    name = request.name or _owner(request.options) or ("" if request.workers else os.environ.get(VARIABLE, ""))
+    name = name or "processes"
+    try:
+        kind = EXECUTORS.get(EXECUTORS.check(name))
+    except PluginError:
+        raise
+    except UsageError as error:
+        raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS.names())}") from error
+    own = {option.name for option in kind.options}
+    for option in request.options:
+        if option not in own:
+            others = [other for other in EXECUTORS.names() if option in _options_of(other)]
+            raise UsageError(f"--{option} requires --executor {' or '.join(others) or '…'}; {name} has no such option")
+    return kind, replace(request, name=name)
 
-    return DaskExecutor(store, workers=workers, threads=threads, scheduler=scheduler)
+
+def _owner(options: Mapping[str, str]) -> str:
+    """Return the only executor that has one of some options; "" if none is the only one."""
+    owners = [[name for name in EXECUTORS.names() if option in _options_of(name)] for option in options]
+    return next((names[0] for names in owners if len(names) == 1), "")
+
+
+def _options_of(name: str) -> set[str]:
+    try:
+        return {option.name for option in EXECUTORS.get(name).options}
+    except PluginError:
+        return set()
+
+
+def make_executor(store: Store, request: ExecutorRequest = ExecutorRequest()) -> Executor:
+    """Return the executor that a run asks for; the caller closes it.
+
+    Raises:
+        UsageError: if the request contradicts itself, or the executor is not installed or cannot be reached.
+        PluginError: if its plugin cannot be loaded.
+    """
+    kind, request = chosen(request)
+    return kind.make(store, request)
+
+
+def executor_size(request: ExecutorRequest) -> ExecutorSize:
+    """Return how much the executor that a run asks for computes at a time, without starting it.
+
+    Raises:
+        UsageError: if the request contradicts itself.
+    """
+    kind, request = chosen(request)
+    return kind.size(request)
 
 
 def shape(workers: int = 0, threads: int = 0) -> tuple[int, int]:
-    """Return the number of workers on this host and the threads of each, as `make_executor` chooses them.
-
-    Raises:
-        UsageError: if there are not enough cores.
-    """
+    """Return the number of workers on this host and the threads of each, as `make_executor` chooses them."""
     cores = available_threads()
     if not workers and not threads:
         workers = max(1, min(cores, free_memory_bytes() // WORKER_BYTES or cores))

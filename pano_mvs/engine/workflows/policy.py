@@ -79,6 +79,9 @@ class Policy(BaseModel):
     memory: str | int = Field(
         default=0, description="memory that one unit needs, such as 2GB; only as many units run at a time as fit"
     )
+    optional: bool = Field(
+        default=False, description="whether the stage is left out, with a warning, if no plugin offers it"
+    )
     to: str = Field(default="", description="folder for the stage's files, inside the output folder")
 
     @property

@@ -45,6 +45,7 @@ class Workflow:
     overrides: tuple[str, ...] = ()  # the `--set` and `--images` options that were applied
     # its plugin files, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()  # why optional stages are missing
 
     @property
     def id(self) -> str:
@@ -108,6 +109,7 @@ class WorkflowReader:
         applying.apply(overrides, images=images)
         if not entries and not self.problems.lines:
             self.problems.add(files[-1].root.place, "no stage is left")
+        left_out = self._leave_out(entries)
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
         if self.problems.lines:
             written = {name for file in files for name, node in file.stages.items() if node.value is not None}
@@ -116,7 +118,8 @@ class WorkflowReader:
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
         below = (f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in files[:-1])
-        return Workflow(name, path, "".join([files[-1].text, *below]), stages, tuple(shown), self.plugins)
+        text = "".join([files[-1].text, *below])
+        return Workflow(name, path, text, stages, tuple(shown), self.plugins, left_out)
 
     def inherited(self, text: str, path: Path) -> dict[str, Located]:
         """Return the stages that a file inherits, and load the plugins of all its files.
@@ -170,6 +173,24 @@ class WorkflowReader:
     def _folder(self, item: Located) -> Path:
         """Return the folder that a relative path starts from: that of its file, or the current one for overrides."""
         return resolved(Path()) if item.origin else self.folders.get(item.file, self.base)
+
+    def _leave_out(self, entries: dict[str, Located]) -> tuple[str, ...]:
+        """Remove optional stages that no plugin offers, and return why each is missing."""
+        missing = {
+            name: use
+            for name, node in entries.items()
+            if "optional" in node.value
+            and node.value["optional"].value is True
+            and isinstance(use := node.value["use"].value, str)
+            and use not in self.registry.stages
+        }
+        for name in missing:
+            del entries[name]
+        return tuple(
+            f"stage {name!r} is left out, because it is optional and no plugin offers {use}; `pano-mvs plugins` lists "
+            "all plugins"
+            for name, use in missing.items()
+        )
 
     def _stage(self, name: str, node: Located) -> StageEntry | None:
         use = node.value["use"]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.images.video import KeptFile
+from pano_mvs.io.kept_file import KeptFile
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import MAX_PIXELS, decode_image, decode_picture
 from pano_mvs.scene.image_header import holds_floats, stated_size

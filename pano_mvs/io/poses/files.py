@@ -27,6 +27,7 @@ from pano_mvs.io.poses.metashape import read_metashape
 from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
 from pano_mvs.io.poses.positions import NO_POSES, csv_cells, holds_positions, latitude_heading, read_positions
 from pano_mvs.io.poses.trajectories import SUFFIXES, match_times, read_trajectory
+from pano_mvs.io.readers import pose_reader_of
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
@@ -68,7 +69,8 @@ def read_poses(path: Path) -> Poses:
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
         with # are ignored;
-      * a trajectory of the TUM benchmark, .txt or .tum, whose images are called by their times (see `match_images`).
+      * a trajectory of the TUM benchmark, .txt or .tum, whose images are called by their times (see `match_images`);
+      * what a plugin reads (`pano_mvs.io.readers`).
 
     Cameras of other kinds than panoramas are in `rejected`, with the reason.
 
@@ -93,6 +95,9 @@ def _groups_in(path: Path) -> list[Poses]:
 
 
 def _read_file(path: Path) -> FilePoses:
+    if exists(path) and (reader := pose_reader_of(path)) is not None:
+        found = reader.read(path)
+        return FilePoses([dict(group) for group in found.groups], dict(found.others), metric=found.metric)
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return FilePoses([read_csv(path)])

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.blocks import divide_capture
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, read_regular, remove_whole, write_text
-from pano_mvs.core.memory import size_text, total_memory_bytes
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
-from pano_mvs.engine.executors.queues import read_queue
+from pano_mvs.engine.executors.choose import executor_size
 from pano_mvs.engine.planning.forecast import Experience, expected_memory
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import files_of
@@ -392,6 +392,4 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
 
 def _memory_bytes(execution: Execution) -> int:
     """Return the memory of the machine that computes the units; 0 if unknown."""
-    if execution.queue is not None:
-        return read_queue(execution.queue).memory_bytes
-    return 0 if execution.scheduler else total_memory_bytes()
+    return executor_size(execution.request).memory_bytes

@@ -20,7 +20,7 @@ from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors import choose, unit_requests
 from pano_mvs.engine.executors import processes as worker_process
-from pano_mvs.engine.executors.choose import SerialExecutor, make_executor
+from pano_mvs.engine.executors.choose import ExecutorRequest, SerialExecutor, make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
@@ -216,7 +216,7 @@ def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: s
 if x.value == 30:
     {how}
 """)
-    result = run_with(toy, lambda store: make_executor(store, workers=1, threads=1))
+    result = run_with(toy, lambda store: make_executor(store, ExecutorRequest(workers=1, threads=1)))
     (failure,) = (f for f in result.failures if f.stage == "scaled")
     assert (failure.item, result.exit_code) == ("3.txt", 3)
     assert f"its worker process died ({cause})" in failure.cause
@@ -491,19 +491,19 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = Store(tmp_path)
-    assert make_executor(store, "serial").name == "serial"
-    assert make_executor(store, workers=3).capacity == 3
-    one = make_executor(store, workers=1)
+    assert make_executor(store, ExecutorRequest("serial")).name == "serial"
+    assert make_executor(store, ExecutorRequest(workers=3)).capacity == 3
+    one = make_executor(store, ExecutorRequest(workers=1))
     assert (one.name, one.capacity) == ("processes", 1)
     monkeypatch.delenv("PANO_MVS_EXECUTOR")
     monkeypatch.setattr(choose, "available_threads", lambda: 1)
     assert make_executor(store).name == "processes"
     with pytest.raises(UsageError, match="there is no executor 'thread'"):
-        make_executor(store, "thread")
+        make_executor(store, ExecutorRequest("thread"))
     with pytest.raises(UsageError, match="one unit at a time"):
-        make_executor(store, "serial", workers=2)
-    with pytest.raises(UsageError, match="--scheduler requires --executor dask"):
-        make_executor(store, "processes", scheduler="tcp://somewhere:8786")
+        make_executor(store, ExecutorRequest("serial", 2))
+    with pytest.raises(UsageError, match=r"--scheduler requires --executor .*; processes has no such option"):
+        make_executor(store, ExecutorRequest("processes", options={"scheduler": "tcp://somewhere:8786"}))
 
 
 def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:

@@ -52,6 +52,17 @@ def test_a_stage_without_a_library_that_it_needs_is_refused_before_anything_runs
         toy.session()
 
 
+def test_an_optional_stage_that_no_plugin_offers_is_left_out_and_named(toy: Toy) -> None:
+    toy.edit("wf.yaml", lambda text: text + "  extra: {use: toy.nobody, optional: true, by: 3}\n")
+    session = toy.session()
+    assert "extra" not in session.workflow.stages
+    (reason,) = session.workflow.left_out
+    assert reason.startswith("stage 'extra' is left out, because it is optional and no plugin offers toy.nobody")
+    toy.edit("wf.yaml", lambda text: text.replace("toy.nobody, optional: true", "toy.nobody, optional: false"))
+    with pytest.raises(WorkflowError, match=r"stage 'extra': there is no stage 'toy\.nobody'"):
+        toy.session()
+
+
 def test_the_models_of_presets_need_no_ranges() -> None:
     """`--until colmap` computed everything before masks.moving, 262 s in place of 40."""
     registry = Registry.installed()

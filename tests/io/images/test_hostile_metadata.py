@@ -8,7 +8,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from functools import cache
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,8 +27,6 @@ from pano_mvs.io.images.metadata import (
     position_from_exif,
     read_container,
 )
-from pano_mvs.io.images.video import _movie_header, describe_video, frames_between
-from pano_mvs.scene.image_file import MAX_PIXELS
 from pano_mvs.stages.source import FolderParams, folder, folder_memory_bytes, list_folder
 from tests.io.images.pictures import (
     app1,
@@ -220,38 +217,3 @@ def test_any_stated_sizes_of_a_picture_are_read(sizes: list[tuple[int, int]], ab
     ispe = b"".join(struct.pack(">I4sIII", 20, b"ispe", 0, width, height) for width, height in sizes)
     ftyp = struct.pack(">I4s4sI4s", 20, b"ftyp", b"heic", 0, b"mif1")
     read_with_neighbours(ftyp + ispe + struct.pack(">I4s", 8 + len(about), b"mdat") + b"Exif\0\0" + about, "heic")
-
-
-@cache
-def video() -> bytes:
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "video.mp4")
-        form: Any = cv2.VideoWriter.fourcc(*"mp4v")
-        writer = cv2.VideoWriter(str(path), form, 5.0, (128, 64))
-        for number in range(6):
-            writer.write(np.full((64, 128, 3), 40 * number, np.uint8))
-        writer.release()
-        return path.read_bytes()
-
-
-@pytest.mark.slow
-@given(CHANGES)
-@settings(max_examples=150, deadline=None)
-def test_any_boxes_of_a_video_are_read(changes: list[tuple[int, int, int, int]]) -> None:
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "video.mp4")
-        path.write_bytes(with_hostile_fields(video(), changes))
-        try:
-            describe_video(path)
-            for _, frame in islice(frames_between(path, 0.0, 10.0), 10):
-                assert frame.size <= 3 * MAX_PIXELS
-        except InputError as error:
-            assert str(path) in str(error)  # noqa: PT017
-
-
-@pytest.mark.parametrize("size", [0, 15, 2**40, 2**64 - 1])
-def test_a_box_may_state_any_size(tmp_path: Path, size: int) -> None:
-    """The position behind it may be none that a file can have."""
-    path = tmp_path / "video.mp4"
-    path.write_bytes(b"\0\0\0\1free" + size.to_bytes(8, "big") + bytes(64))
-    assert _movie_header(path) == b""

@@ -153,7 +153,7 @@ _OTHERS = {  # readers of files that state names, with the test of them; the rea
 _NO_NAMES = {
     *(f"io.ply.{name}" for name in ("read_ply", "read_ply_mesh", "read_ply_points", "open_ply_points")),
     *(f"io.ranges.read_{name}" for name in ("range_tiff", "normals", "confidence_png", "npy")),
-    *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.video.read_times"),
+    *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map"),
     *("io.images.metadata.read_container", "io.transforms_json.open_mask", "io.meshes.read_glb"),
     *("io.poses.json_files.read_json_value", "session.merging.block_runs.open_blocks", "session.session.open_session"),
 }

@@ -13,7 +13,7 @@ from unittest.mock import patch
 from pano_mvs.cli.app import main
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.executors.choose import SerialExecutor
+from pano_mvs.engine.executors.choose import ExecutorRequest, SerialExecutor
 from pano_mvs.engine.executors.execute import execute_unit
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 
@@ -53,7 +53,7 @@ class SimulatedExecutor(SerialExecutor):
         return record
 
 
-def _simulated(store: Store, *_name: str, **_settings: object) -> Executor:
+def _simulated(store: Store, _request: ExecutorRequest) -> Executor:
     return SimulatedExecutor(store)
 
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pano_mvs_tours.tour_folders import list_scenes
 
 import pano_mvs
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.house_file import HOUSE_FILE, read_house
-from pano_mvs.io.images.tours import list_scenes
 from pano_mvs.scene import House, PlacedBy, Poses
 from pano_mvs.scene.pose_groups import split_groups
 

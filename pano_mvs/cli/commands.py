@@ -1,0 +1,174 @@
+"""Commands of plugins, beside the built-in ones: a typer app, or a function as typer takes it.
+
+    @register_command("hello")
+    def hello(name: Annotated[str, typer.Argument(help="Whom to greet.")]) -> None:
+        '''Say hello.'''
+        Console().say(f"hello {name}")
+
+A command `cache.push` is the command `push` of the group `cache`. The module of an installed plugin is imported when
+its command is run, or when the help lists it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from inspect import isfunction
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from typer.core import TyperGroup
+from typer.main import get_command as command_of_app
+
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.endings import guarded
+from pano_mvs.core.doors import Door, RunOption
+from pano_mvs.core.errors import PanoMvsError, PluginError
+
+Command = typer.Typer | Callable[..., None]
+Decorator = Callable[[Callable[..., None]], Callable[..., None]]
+
+
+def _accepted(value: object) -> Command | None:
+    return value if isinstance(value, typer.Typer) or isfunction(value) else None
+
+
+COMMANDS = Door[Command]("command", "pano_mvs.commands", accepts=_accepted)
+
+
+def register_command(name: str) -> Decorator:
+    """Return a decorator that registers a function as the command `pano-mvs NAME`.
+
+    Its parameters are annotated as typer's are; errors of `pano_mvs.core.errors` become messages and exit codes.
+    """
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        COMMANDS.register(name, guarded(function), function)
+        return function
+
+    return register
+
+
+class PluginGroup(TyperGroup):
+    """A group of commands to which plugins add; typer's own types of commands differ between its versions."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands, those of plugins last."""
+        own = super().list_commands(ctx)
+        load_files()
+        prefix = _prefix(ctx)
+        return [*own, *(name for full in COMMANDS.names() if (name := _within(full, prefix)) and name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command; of a plugin that cannot be loaded, one that says so."""
+        own: Any = super().get_command(ctx, cmd_name)
+        if own is not None:
+            options = getattr(own.callback, _OPTIONS, None)
+            return own if options is None else _command(_with_options(own.callback.__wrapped__, options()), cmd_name)
+        full = f"{_prefix(ctx)}{cmd_name}"
+        if full not in COMMANDS.names():
+            load_files()
+        if full not in COMMANDS.names() or "." in cmd_name:
+            return None
+        try:
+            return _command(COMMANDS.get(full), cmd_name)
+        except PluginError as error:
+            return _command(_unusable(error), cmd_name, ignore_unknown_options=True, allow_extra_args=True)
+
+
+def _prefix(ctx: Any) -> str:
+    """Return the names of the groups above the commands of a group, each with a dot; "" for the commands themselves."""
+    names = list[str]()
+    while ctx.parent is not None:
+        names.append(f"{ctx.info_name}.")
+        ctx = ctx.parent
+    return "".join(reversed(names))
+
+
+def _within(full: str, prefix: str) -> str:
+    """Return the name of a command in a group; "" if it lies elsewhere."""
+    name = full.removeprefix(prefix)
+    return name if full.startswith(prefix) and "." not in name else ""
+
+
+def load_files() -> None:
+    """Import the files in the user's plugin folders, which register commands, executors and observers."""
+    from pano_mvs.engine.stages.registry import Registry, plugin_files_in, user_plugin_folders
+
+    if any(plugin_files_in(folder) for folder in user_plugin_folders()):
+        Registry.installed()
+
+
+def _command(command: Command, name: str, **context: object) -> Any:
+    """Return a command as typer runs it."""
+    if not isinstance(command, typer.Typer):
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app.command(name, context_settings={"help_option_names": ["-h", "--help"], **context})(command)
+        command = app
+    made = command_of_app(command)
+    made.name = name
+    return made
+
+
+def _unusable(error: PanoMvsError) -> Callable[..., None]:
+    def say() -> None:
+        Console(stderr=True).say(f"[red]error:[/] {escape(str(error))}")
+        raise typer.Exit(error.exit_code)
+
+    say.__doc__ = f"(cannot be used: {error})"
+    return say
+
+
+_OPTIONS = "__pano_mvs_options__"
+
+
+def takes_options(options: Callable[[], Mapping[str, RunOption]]) -> Decorator:
+    """Return a decorator of a command that takes options of plugins, too: as argument `options`, name to values.
+
+    Args:
+        options: returns the options by name; it is called when the command is run or described.
+    """
+
+    def extend(command: Callable[..., None]) -> Callable[..., None]:
+        setattr(command, _OPTIONS, options)
+        return command
+
+    return extend
+
+
+def _with_options(command: Callable[..., None], options: Mapping[str, RunOption]) -> Callable[..., None]:
+    """Return a command with further options."""
+
+    def take(**values: Any) -> None:
+        given = dict[str, tuple[str, ...]]()
+        for name in options:
+            value = values.pop(_parameter(name))
+            if value:
+                given[name] = () if value is True else tuple(value) if isinstance(value, list) else (value,)
+        command(**values, options=given)
+
+    take.__name__, take.__doc__ = command.__name__, command.__doc__
+    signature = inspect.signature(command)
+    parameters = [*signature.parameters.values(), *map(_as_parameter, options.values())]
+    take.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    take.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return take
+
+
+def _as_parameter(option: RunOption) -> inspect.Parameter:
+    info = typer.Option(
+        f"--{option.name}",
+        help=option.help,
+        metavar=option.metavar or None,
+        show_default=False,
+        rich_help_panel="Plugins",
+    )
+    hint: Any = bool if not option.metavar else list[str] | None if option.multiple else str
+    default = None if option.multiple else "" if option.metavar else False
+    parameter = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(_parameter(option.name), parameter, default=default, annotation=Annotated[hint, info])
+
+
+def _parameter(option: str) -> str:
+    return option.replace("-", "_")

@@ -1,0 +1,1 @@
+"""Executors on other machines (dask, SLURM, PBS, LSF, SGE), and `cache push` and `cache pull`."""
