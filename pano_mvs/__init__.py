@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError, WorkflowError
-    from pano_mvs.evaluation import evaluate_cloud, evaluate_depth, evaluate_poses, evaluate_run
     from pano_mvs.results.run_output import RunOutput, RunView, load
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.captures import run
@@ -41,10 +40,6 @@ __all__ = [
     "ViewOptions",
     "WorkflowError",
     "__version__",
-    "evaluate_cloud",
-    "evaluate_depth",
-    "evaluate_poses",
-    "evaluate_run",
     "load",
     "plan",
     "run",
@@ -67,10 +62,6 @@ _HOMES = {
     "UsageError": "core.errors",
     "ViewOptions": "viewer.view",
     "WorkflowError": "core.errors",
-    "evaluate_cloud": "evaluation",
-    "evaluate_depth": "evaluation",
-    "evaluate_poses": "evaluation",
-    "evaluate_run": "evaluation",
     "load": "results.run_output",
     "plan": "session.planning",
     "run": "session.captures",

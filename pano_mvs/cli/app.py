@@ -27,7 +27,6 @@ from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.endings import guarded
-from pano_mvs.cli.evaluate.app import evaluate_app
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
@@ -57,7 +56,6 @@ app = typer.Typer(
 )
 app.add_typer(stage_app, name="stage")
 app.add_typer(plugin_app, name="plugin")
-app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(cache_app, name="cache")
 
 

@@ -16,20 +16,19 @@ from rich.table import Table
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
-from pano_mvs.core.text import shortened_list
+from pano_mvs.core.text import finite_or_none, shortened_list
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.evaluation.inputs import read_truth
-from pano_mvs.evaluation.tables import finite_or_none
 from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.truth import read_truth
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
+from pano_mvs.session.cost_curves import curve_text
+from pano_mvs.session.inspection import Inspection, UnitFound, inspect_pixel
 from pano_mvs.session.session import Session, run_command
 from pano_mvs.stages.depth import SweepParams
-from pano_mvs.viewer.curves import curve_text
-from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Pa
     """Print the analysis of a pixel."""
     found = _inspection(session, wanted)
     if plot is not None:
-        from pano_mvs.viewer.curves import write_curve_picture
+        from pano_mvs.session.cost_curves import write_curve_picture
 
         if plot.suffix.lower() != ".png":
             raise UsageError(f"--plot {plot}: the plot is a PNG image, so the file name must end in .png")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from xml.etree import ElementTree
@@ -117,3 +118,8 @@ def xml_root(data: bytes) -> ElementTree.Element:
         return ElementTree.fromstring(data)  # noqa: S314  # without entities
     except (ElementTree.ParseError, LookupError) as error:  # LookupError: an encoding that nobody knows
         raise ValueError(f"not an XML file ({error})") from error
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number for JSON, which has no NaN and no infinity."""
+    return float(value) if math.isfinite(value) else None

@@ -4,7 +4,6 @@ They are registered through the entry point `pano_mvs.plugins`, like stages of p
 """
 
 from pano_mvs.stages.depth import exchange, full_size, known_floors, nearest, patchmatch, plain_surfaces, sweep
-from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
 from pano_mvs.stages.exports.floor_plan import floor_plan

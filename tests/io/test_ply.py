@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from pano_mvs_evaluation.clouds.evaluate import evaluate_cloud
 
 from pano_mvs.api import Context, InputError, PointCloud, Poses, WorldAxes
-from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.io.ply import RGB, open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world

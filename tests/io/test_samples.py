@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import pixel_from_ray, ray_grid
 from pano_mvs.io.images.captures import describe_picture, list_pictures
+from pano_mvs.io.truth import read_truth
 
 SAMPLES = Path(__file__).parents[2] / "workflows" / "samples"
 CLASSROOM, REAL_ROOMS = SAMPLES / "classroom", SAMPLES / "real_rooms"

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 import pytest
+from pano_mvs_evaluation.stages import TruthParams, truth
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
@@ -26,7 +27,6 @@ from pano_mvs.scene.files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 from pano_mvs.stages.depth import PatchMatchParams, SweepParams, exchange, patchmatch, sweep
-from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
     DenseParams,

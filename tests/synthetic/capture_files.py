@@ -18,7 +18,7 @@ from pano_mvs.testing.room import Room, render
 def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, size_hw: tuple[int, int]) -> None:
     """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
 
-    `pano_mvs.evaluation.inputs.read_truth` reads the ground truth: poses are cam_from_world, ranges are float32
+    `pano_mvs.io.truth.read_truth` reads the ground truth: poses are cam_from_world, ranges are float32
     with inf where there is no surface, and each view has the SHA-256 of its image.
     """
     write_views(folder, (render(room, pose, size_hw) for pose in poses), poses)

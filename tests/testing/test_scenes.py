@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
+from pano_mvs.io.truth import read_truth
 from pano_mvs.testing.room import Room, range_along, render
 from tests.stored import read_picture
 from tests.synthetic.paints import STEEL

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.cost_curve import CostCurve
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.scene.image_file import decode_image
-from pano_mvs.viewer.curves import curve_text, write_curve_picture
-from pano_mvs.viewer.inspection import Inspection, SourceSight
+from pano_mvs.session.cost_curves import curve_text, write_curve_picture
+from pano_mvs.session.inspection import Inspection, SourceSight
 
 
 def inspection(*, sources: int = 2, by_paths: bool = True, true_range: float = 4.0, image: str = "a.jpg") -> Inspection:

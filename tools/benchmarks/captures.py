@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import FilePart, Panorama
 from tests.stored import read_picture
 from tests.synthetic.scenes import Scene

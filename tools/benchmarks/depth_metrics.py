@@ -1,4 +1,4 @@
-"""The usual scores of a range map (`pano_mvs.evaluation`), as attributes."""
+"""The usual scores of a range map (`pano_mvs_evaluation`), as attributes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
-
-from pano_mvs.evaluation.ranges.view_scores import ScoreSettings, score_view
+from pano_mvs_evaluation.ranges.view_scores import ScoreSettings, score_view
 
 
 def depth_metrics(

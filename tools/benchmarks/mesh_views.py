@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from held_out_meshes import HeldOutScores, held_out_scores
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -24,7 +25,6 @@ from pano_mvs.algorithms.mesh.texture import TexturedMesh
 from pano_mvs.algorithms.mesh.volume import most_certain
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.exports.mesh import MeshParams, MeshView, TexturedParams, solved_mesh, textured_mesh
-from tests.evaluation.held_out_meshes import HeldOutScores, held_out_scores
 from tools.benchmarks.captures import Capture, read_capture
 from tools.benchmarks.dense_chain import DenseChain, context
 

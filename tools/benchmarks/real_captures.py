@@ -37,7 +37,7 @@ import pano_mvs
 from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.algorithms.rendering import draw_cloud, inside_camera, viewpoints
-from pano_mvs.evaluation.poses import relative_pose_errors
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.residuals import reprojection_residuals
 from pano_mvs.results.run_output import RunOutput

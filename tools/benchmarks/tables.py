@@ -18,7 +18,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations
-from pano_mvs.evaluation.poses import align_centers
+from pano_mvs.geometry.pose_errors import align_centers
 from pano_mvs.scene import Poses
 from pano_mvs.session.session import presets_folder
 from tools.benchmarks.captures import Capture, read_capture

@@ -31,9 +31,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from pano_mvs_evaluation import ScoreSettings, evaluate_depth, evaluate_poses
 
 import pano_mvs
-from pano_mvs.evaluation import ScoreSettings, evaluate_depth, evaluate_poses
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from tests.synthetic.scenes import Scene, write_scene

@@ -15,13 +15,13 @@ import numpy as np
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
-from pano_mvs.evaluation.inputs import find_ranges, read_truth
 from pano_mvs.io.colmap.workspace import read_colmap_map, write_depth_map
 from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_mesh, write_ply, write_ply_mesh
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.io.ranges import read_normals
+from pano_mvs.io.truth import find_ranges, read_truth
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.exr import has_exr, write_exr
 from pano_mvs.scene.image_file import decode_image

@@ -18,8 +18,8 @@ from pano_mvs.algorithms.poses.colmap.database import Cameras, face_of_bearing, 
 from pano_mvs.algorithms.poses.colmap.mapping import Mapper
 from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
 from pano_mvs.algorithms.poses.colmap.solver import solve_colmap
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render

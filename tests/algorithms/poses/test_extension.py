@@ -11,8 +11,8 @@ import pytest
 from pano_mvs.algorithms.poses.colmap.database import Cameras
 from pano_mvs.algorithms.poses.colmap.solver import extend_with_colmap
 from pano_mvs.algorithms.poses.extension import extend_poses
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.scene import Features, Poses, TwoView
 from tests.algorithms.poses.synthetic_capture import random_poses, synthetic_features, synthetic_two_views
 

@@ -13,8 +13,8 @@ from pano_mvs.algorithms.poses.placement.placed_model import (
     pairs_of,
 )
 from pano_mvs.algorithms.poses.placement.resection import points_needed, resection_errors
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture, shifted_pose
 
 FALSE = {(0, 3): 1, (1, 2): -1}

@@ -22,8 +22,8 @@ from pano_mvs.algorithms.poses.placement.resection import refine_resection
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from tests.algorithms.poses.synthetic_capture import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.scene import Poses, TwoView
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture
 from tools.benchmarks.poses.placements import judge_placements

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.evaluation.poses import PoseErrors, relative_pose_errors
+from pano_mvs.geometry.pose_errors import PoseErrors, relative_pose_errors
 from pano_mvs.io.colmap.reader import read_colmap_model
 from pano_mvs.io.poses.json_files import read_posed_views
 from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pano_mvs_evaluation.ranges import tables as depth_tables
 
 from pano_mvs.cli import inspect_command as inspect_text
 from pano_mvs.engine.cache.packs import RECORD
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.evaluation.ranges import tables as depth_tables
 from pano_mvs.results.figures import figure
 from tests.cli.conftest import SMALL, deliverables
 

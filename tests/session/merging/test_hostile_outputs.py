@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pano_mvs_evaluation.ranges.error_picture import write_depth_pictures
+from pano_mvs_evaluation.ranges.evaluate import evaluate_depth
 
 import pano_mvs
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import item_problem
-from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
-from pano_mvs.evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
 from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.house_file import read_house

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pano_mvs_evaluation.clouds.distances import PointsInMemory, cloud_distances, score_cloud
+from pano_mvs_evaluation.clouds.true_surface import TrueView, surface_of_views, view_points
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray, Mask
-from pano_mvs.evaluation.clouds.distances import PointsInMemory, cloud_distances, score_cloud
-from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_views, view_points
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE

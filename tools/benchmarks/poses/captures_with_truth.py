@@ -31,8 +31,8 @@ from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
 from pano_mvs.algorithms.poses.colmap.solver import solve_colmap
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
-from pano_mvs.evaluation.poses import AUC_LIMITS_DEG, relative_pose_errors
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_rotvec
+from pano_mvs.geometry.pose_errors import AUC_LIMITS_DEG, relative_pose_errors
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.evaluation.poses import camera_extent
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, nearest_rotation
+from pano_mvs.geometry.pose_errors import camera_extent
 from pano_mvs.scene import Poses
 
 _MAX_ROUNDS = 10

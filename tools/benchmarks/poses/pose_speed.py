@@ -32,7 +32,7 @@ from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
-from pano_mvs.evaluation.poses import relative_pose_errors
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups

@@ -29,8 +29,8 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
-from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_quat_wxyz
+from pano_mvs.geometry.pose_errors import relative_pose_errors
 from tests.synthetic.places import large_plain_room
 from tests.synthetic.scenes import poles, weak_room, white_room
 from tools.benchmarks.poses.captures_with_truth import Cameras, Pictures, cameras_of, load, native
