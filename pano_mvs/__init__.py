@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.captures import run
     from pano_mvs.session.planning import RunPlan, plan
-    from pano_mvs.share import Shared, ShareOptions, share_run
-    from pano_mvs.viewer.view import ViewOptions, view_run
 
 __version__ = "0.1.0"
 
@@ -33,18 +31,13 @@ __all__ = [
     "RunStoppedError",
     "RunSummary",
     "RunView",
-    "ShareOptions",
-    "Shared",
     "StoreError",
     "UsageError",
-    "ViewOptions",
     "WorkflowError",
     "__version__",
     "load",
     "plan",
     "run",
-    "share_run",
-    "view_run",
 ]
 
 # Where each name is; imported when it is first used, since the libraries behind it take a second to load.
@@ -56,17 +49,12 @@ _HOMES = {
     "RunStoppedError": "core.errors",
     "RunSummary": "results.summary",
     "RunView": "results.run_output",
-    "ShareOptions": "share",
-    "Shared": "share",
     "StoreError": "core.errors",
     "UsageError": "core.errors",
-    "ViewOptions": "viewer.view",
     "WorkflowError": "core.errors",
     "load": "results.run_output",
     "plan": "session.planning",
     "run": "session.captures",
-    "share_run": "share",
-    "view_run": "viewer.view",
 }
 
 

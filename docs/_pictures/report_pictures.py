@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.share.chromium import Chromium, chromium
+from tests.browsers.chromium import Chromium, chromium
 
 IMAGES = Path(__file__).parents[1] / "images"
 

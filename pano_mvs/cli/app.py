@@ -11,7 +11,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,6 @@ from pano_mvs import __version__
 from pano_mvs.cli.cache_commands import cache_app
 from pano_mvs.cli.calibrate_command import calibrate
 from pano_mvs.cli.commands import PluginGroup, load_files, takes_options
-from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.endings import guarded
@@ -78,7 +77,6 @@ def options(
 _worker_option = partial(typer.Option, rich_help_panel="Workers")
 _disk_option = partial(typer.Option, rich_help_panel="Disk and messages")
 _block_option = partial(typer.Option, rich_help_panel="Blocks of a large capture")
-_shown_option = partial(typer.Option, rich_help_panel="What is shown")
 
 
 @dataclass(frozen=True)
@@ -221,38 +219,6 @@ def run(given: RunArguments, options: Mapping[str, tuple[str, ...]] | None = Non
 
 @app.command()
 @guarded
-def tour(
-    images: Annotated[
-        Path,
-        typer.Argument(metavar="PATH", help="Folder of panoramas or of a virtual tour, or a video of a walk."),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Output folder; default: out/<name of PATH>. The page is in <output folder>_page."),
-    ] = None,
-    workflow: Annotated[
-        str,
-        typer.Option(
-            "--workflow",
-            metavar="WORKFLOW",
-            help="A preset or a workflow file; default: mesh, or walk for a video.",
-            autocompletion=complete_workflow,
-            show_default=False,
-        ),
-    ] = "",
-    overrides: SetOption = None,
-    cache: CacheOption = None,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the page in a browser.")] = False,
-) -> None:
-    """Make a page to walk through from panoramas: run a workflow, write the page, and open it in a browser."""
-    from pano_mvs.cli.page_commands import TourWanted, make_tour
-
-    wanted = TourWanted(images, out, workflow, tuple(overrides or ()), cache)
-    raise typer.Exit(make_tour(wanted, Console(), opens=not no_open))
-
-
-@app.command()
-@guarded
 def plan(
     workflow: WorkflowArgument,
     images: ImagesOption = None,
@@ -375,70 +341,13 @@ def watch_output(out: Annotated[Path, typer.Argument(metavar="OUT", help="The ou
 @guarded
 def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
     """Rewrite report.html from run.json and the cache, without computing anything."""
-    from pano_mvs.cli.page_commands import rewrite_report
+    from pano_mvs.cli.report_command import rewrite_report
 
     rewrite_report(out, cache, Console())
 
 
 app.command()(plugins)
 app.command()(doctor)
-
-
-@dataclass(frozen=True)
-class ViewArguments:
-    """The arguments and options of `pano-mvs view`."""
-
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")]
-    screenshot: Annotated[
-        Path | None,
-        typer.Option(
-            "--screenshot", metavar="FILE", help="Write an image instead of opening a window; works without a display."
-        ),
-    ] = None
-    view: Annotated[str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")] = (
-        "overview"
-    )
-    color: Annotated[str, _shown_option("--color", help="Colours: rgb, confidence, views, normals or height.")] = "rgb"
-    surface: Annotated[
-        str,
-        _shown_option(
-            "--show",
-            metavar="cloud|mesh|both",
-            help="What to show; default: the cloud if it exists.",
-            show_default=False,
-        ),
-    ] = ""
-    points: Annotated[int, _shown_option("--points", min=0, help="Maximum number of points to draw; 0: all.")] = (
-        2_000_000
-    )
-    size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")] = (
-        "1280x860"
-    )
-    images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")] = None
-    labels: Annotated[bool, _shown_option("--labels", help="Show the names of the cameras.")] = False
-    blended: Annotated[bool, _shown_option("--blend", help="Overlay the cloud on the panoramas.")] = False
-    backs: Annotated[bool, _shown_option("--backs", help="Also show points that face away from the viewer.")] = False
-    group: Annotated[
-        int,
-        _shown_option("--group", min=0, help="Group to show if the panoramas form several groups; 0 is the largest."),
-    ] = 0
-    ranges: Annotated[
-        bool, _shown_option("--ranges", help="Inside a camera, show its ranges; unconfirmed ones are marked.")
-    ] = False
-
-
-@app.command("view")
-@guarded
-@takes_record
-def view_results(given: ViewArguments) -> None:
-    """View the cloud, the mesh and the cameras, and step inside the panoramas."""
-    from pano_mvs.viewer.view import ViewOptions, view_run
-
-    options = ViewOptions(**{field.name: getattr(given, field.name) for field in fields(ViewOptions)})
-    console = Console()
-    view_run(given.out, options, say=lambda note: console.say(f"note: {escape(note)}"))
-    if given.screenshot is not None:
-        console.say(f"picture in {escape(str(given.screenshot))}")
 
 
 @app.command("scale", context_settings={"ignore_unknown_options": True})
@@ -470,42 +379,6 @@ def scale_results(
         out, tuple(known or ()), camera_height=camera_height, group=group, cache=cache, console=Console()
     )
     raise typer.Exit(code)
-
-
-@app.command()
-@guarded
-def share(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
-    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to write the page to.")],
-    title: Annotated[
-        str, typer.Option("--title", help="Heading; default: the capture's folder.", show_default=False)
-    ] = "",
-    points: Annotated[
-        int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: none.")
-    ] = 1_500_000,
-    triangles: Annotated[
-        int,
-        typer.Option("--triangles", min=0, help="Maximum number of triangles of a mesh without texture; 0: none."),
-    ] = 300_000,
-    width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 8192,
-    quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,
-    rooms: Annotated[
-        Path | None,
-        typer.Option(
-            "--rooms", help="YAML file with the panoramas of each room; default: from folders, names, or what they see."
-        ),
-    ] = None,
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
-    ] = None,
-    cache: CacheOption = None,
-) -> None:
-    """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
-    from pano_mvs.cli.page_commands import share_output
-    from pano_mvs.share import ShareOptions
-
-    options = ShareOptions(title, points, triangles, width, quality, rooms)
-    share_output(out, to, options, images=images, cache=cache, console=Console())
 
 
 app.command()(calibrate)

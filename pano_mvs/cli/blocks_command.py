@@ -19,7 +19,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
-from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, block_runs, divided
+from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, block_runs, decide_blocks, divided
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.progress import Divided, Event, RunFinished
 from pano_mvs.session.running import Execution
@@ -50,6 +50,15 @@ def run_decided(
         show_dry_run(session, Console(), execution=execution, as_json=as_json)
         return 0
     return run_workflow(session, execution, as_json=as_json, advise=advise)
+
+
+def run_capture(session: Session) -> int:
+    """Run a workflow as `pano-mvs run` does without options, in blocks if memory demands it; return the exit code.
+
+    Commands that can follow are not printed.
+    """
+    execution = Execution()
+    return run_decided(session, execution, decide_blocks(session, execution), advise=False)
 
 
 def _run_blocks_shown(

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
+from pano_mvs.algorithms.points.plan_grid import bar_length, bar_text
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors

@@ -98,7 +98,8 @@ class RunOutput:
 
     def view(self, options: pano_mvs.ViewOptions | None = None) -> NDArray[np.uint8] | None:
         """View the run in a window until it is closed, or write an image of it; see `pano_mvs.view_run`."""
-        return pano_mvs.view_run(self, options)
+        shown: NDArray[np.uint8] | None = pano_mvs.view_run(self, options)
+        return shown
 
     def has_file(self, name: str) -> bool:
         """Return whether a file is in the output folder and not left over from an earlier run.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pano_mvs
-from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
+from pano_mvs.algorithms.points.plan_grid import find_storeys
 from pano_mvs.core.extras import installed_version
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
 from pano_mvs.algorithms.floor_plan.rooms import Side
 from pano_mvs.algorithms.floor_plan.walls_and_openings import StoreyPlan, _Frame, plan_storey
+from pano_mvs.algorithms.points.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import RangeMap

@@ -13,8 +13,8 @@ import pytest
 from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
 from tests.io.images.pictures import app1, full_sphere, xmp
 from tests.permissions import permissions_hold
-from tests.share.box_run import box_run
 from tests.stored import read_picture
+from tests.synthetic.box_run import box_run
 
 TO_POSES = ("--until", "poses", *SMALL)
 

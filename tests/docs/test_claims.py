@@ -181,7 +181,7 @@ def test_versions_of_what_the_package_holds_are_right() -> None:
     wheels = {version for page in PAGES for version in re.findall(r"pano_mvs-([\d.]+)-py3", page.read_text())}
     assert wheels == {pano_mvs.__version__}
     (three,) = set(re.findall(r"three(?:@|\.js\]\(\S+\) )(0\.\d+)", (ROOT / "docs" / "share.md").read_text()))
-    library = (ROOT / "pano_mvs" / "share" / "web" / "three.min.js").read_text(encoding="utf-8")
+    library = (ROOT / "plugins" / "page" / "pano_mvs_page" / "web" / "three.min.js").read_text(encoding="utf-8")
     assert f'"{three.removeprefix("0.")}"' in library
 
 

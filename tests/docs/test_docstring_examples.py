@@ -16,8 +16,8 @@ COMPUTING = (
     "pano_mvs.session.captures",
     "pano_mvs.session.planning",
     "pano_mvs.results.run_output",
-    "pano_mvs.share.share",
-    "pano_mvs.viewer.view",
+    "pano_mvs_page.share",
+    "pano_mvs_viewer.view",
 )
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import trimesh
 from pano_mvs_evaluation.clouds.evaluate import evaluate_cloud
+from pano_mvs_viewer.cloud_colors import drawn_cloud
 
 from pano_mvs.api import Context, InputError, PointCloud, Poses, WorldAxes
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.io.ply import RGB, open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.stages.exports.files import PlyParams, ply
-from pano_mvs.viewer.cloud_colors import drawn_cloud
 
 POINTS = np.array([[1, 2, 3], [-4.5, 0.25, 1e6]], np.float32)
 

@@ -16,10 +16,10 @@ from pano_mvs.report import write_report
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama
 from pano_mvs.testing.tiny_capture import TinyCapture
+from tests.browsers.chromium import Chromium, chromium
 from tests.report.conftest import stored, summary_of
 from tests.report.test_results import farther
-from tests.share.chromium import Chromium, chromium
-from tests.viewer.scenes import box_cloud
+from tests.synthetic.viewed_scenes import box_cloud
 
 GROUND = "getComputedStyle(document.querySelector('#viewer canvas')).backgroundColor.match(/\\d+/g).map(Number)"
 

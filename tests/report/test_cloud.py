@@ -20,7 +20,7 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
-from tests.viewer.scenes import box_cloud
+from tests.synthetic.viewed_scenes import box_cloud
 
 UP = np.array([0.0, -1.0, 0.0])
 

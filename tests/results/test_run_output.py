@@ -19,7 +19,7 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.test_report import SUMMARY
-from tests.viewer.scenes import box_cloud, write_output
+from tests.synthetic.viewed_scenes import box_cloud, write_output
 
 
 @pytest.fixture

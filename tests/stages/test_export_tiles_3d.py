@@ -18,9 +18,9 @@ from pano_mvs.api import Context, Poses, WorldAxes
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import Tiles3dParams, tiles_3d
+from tests.browsers.chromium import chromium
+from tests.browsers.server import served
 from tests.foreign import npm_packages
-from tests.share.chromium import chromium
-from tests.share.server import served
 
 COUNT, TILE_POINTS, SMALL_TILE = 20_000, 1000, 500
 

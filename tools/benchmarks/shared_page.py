@@ -14,9 +14,9 @@ import statistics
 from pathlib import Path
 from typing import Literal
 
-from tests.share.browser import Browser, open_browser
-from tests.share.chromium import Chromium
-from tests.share.server import served
+from tests.browsers.browser import Browser, open_browser
+from tests.browsers.chromium import Chromium
+from tests.browsers.server import served
 from tools.benchmarks.table import print_table
 
 _READY = "typeof PanoMvs === 'object' && PanoMvs.page && PanoMvs.page.settled"

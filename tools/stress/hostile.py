@@ -306,7 +306,7 @@ GROUPS = {
         ),
     ),
     "commands": Group(20, tuple(f"{_READ}{name}" for name in ("path_that", "an_empty_path"))),
-    "page": Group(20, ("tests/share/test_hostile_page.py",)),
+    "page": Group(20, ("plugins/page/tests/test_hostile_page.py",)),
 }
 MOST_FAULTS = 2
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pano_mvs_viewer.shown_scene import has_faces
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
@@ -28,7 +29,6 @@ from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
 from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.room import capture_poses
-from pano_mvs.viewer.shown_scene import has_faces
 from tests.io.colmap.test_model import SIZES, noisy_poses
 from tests.io.images.pictures import full_sphere, png_chunk, xmp
 from tests.stored import write_npz

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Storey
 from pano_mvs.algorithms.fusion.view import normals_from_range
+from pano_mvs.algorithms.points.plan_grid import Extent, Storey
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.view import grid_rows, on_grid
 from pano_mvs.core.arrays import FloatArray

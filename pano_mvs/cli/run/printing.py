@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.commands import COMMANDS
 from pano_mvs.cli.console import Console
 from pano_mvs.core.paths import resolved
 from pano_mvs.core.text import one_line, plural
@@ -17,7 +18,6 @@ from pano_mvs.results.records import ScoresSummary, Verdict
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.session.session import Session, run_command
-from pano_mvs.viewer.shown_scene import is_to_see
 
 _SHOWN_FAILURES = 20
 
@@ -77,14 +77,20 @@ def next_commands(output: RunOutput, session: Session) -> list[str]:
     commands = []
     if summary.stopped or summary.failures or session.run_options.is_partial:
         commands.append(run_command(session))
-    if is_to_see(summary.files):
+    if has_scene(summary) and "view" in COMMANDS.names():
         commands.append(shlex.join(["pano-mvs", "view", out]))
-    if is_to_share(summary):
+    if is_to_share(summary) and "share" in COMMANDS.names():
         words = ["pano-mvs", "share", out, "--to", f"{out}_page"]
         if resolved(cache_of(summary)) != resolved(Path(summary.cache)):
             words += ["--cache", summary.cache]
         commands.append(shlex.join(words))
     return commands
+
+
+def has_scene(summary: RunSummary) -> bool:
+    """Return whether a run has written a cloud, a mesh or cameras, which viewers can show."""
+    files = (PurePosixPath(name) for name in summary.files)
+    return any(file.name in ("cloud.ply", "mesh.ply") or file.is_relative_to("colmap/sparse/0") for file in files)
 
 
 def is_to_share(summary: RunSummary) -> bool:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import Line
 from pano_mvs.algorithms.floor_plan.walls_and_openings import plan_storey
+from pano_mvs.algorithms.points.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
 from pano_mvs.api import (
     All,
     Context,

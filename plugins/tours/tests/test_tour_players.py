@@ -16,10 +16,10 @@ from pano_mvs.api import Context, Panorama, Pose, Poses, WorldAxes
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import write_png
+from tests.browsers.browser import Browser
+from tests.browsers.chromium import chromium
+from tests.browsers.server import served
 from tests.foreign import npm_packages
-from tests.share.browser import Browser
-from tests.share.chromium import chromium
-from tests.share.server import served
 
 pytestmark = pytest.mark.browser
 

@@ -16,7 +16,7 @@ import pytest
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.command import interrupted_by_termination
-from pano_mvs.cli.run.printing import next_commands, print_summary
+from pano_mvs.cli.run.printing import has_scene, next_commands, print_summary
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.processes import start_of
 from pano_mvs.engine.cache.store import Store
@@ -379,6 +379,13 @@ def test_an_output_folder_opens_the_session_of_its_run(toy: Toy, monkeypatch: py
     (toy.folder / "wf.yaml").unlink()
     with pytest.raises(InputError, match="Give another workflow"):
         reopen("../out", overrides=[], images=None, cache=None)
+
+
+@pytest.mark.parametrize("name", ["cloud.ply", "sad/cloud.ply", "mesh.ply", "colmap/sparse/0/cameras.bin"])
+def test_what_can_be_seen_is_known_from_the_names_of_files(name: str) -> None:
+    assert has_scene(RunSummary(files={"range/1.tiff": "", name: ""}))
+    others = ("range/1.tiff", "report.html", "colmap/images/1.jpg", "points.laz")
+    assert not has_scene(RunSummary(files=dict.fromkeys(others, "")))
 
 
 def _summary(out: Path) -> tuple[StageOutcome, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from numpy.typing import NDArray
+from pano_mvs_viewer.shown_scene import open_scene
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_summary
@@ -22,7 +23,6 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
-from pano_mvs.viewer.shown_scene import open_scene
 from tests.cli.conftest import Command, run_json
 from tests.stored import write_npz
 
