@@ -21,7 +21,6 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache_commands import cache_app
-from pano_mvs.cli.calibrate_command import calibrate
 from pano_mvs.cli.commands import PluginGroup, load_files, takes_options
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
@@ -379,9 +378,6 @@ def scale_results(
         out, tuple(known or ()), camera_height=camera_height, group=group, cache=cache, console=Console()
     )
     raise typer.Exit(code)
-
-
-app.command()(calibrate)
 
 
 @app.command("split")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, PackageNotFoundError, distribution, entry_points
 from typing import Any, TypeVar
 
 from pano_mvs.core.errors import PluginError
@@ -146,6 +146,16 @@ def installed(group: str) -> Mapping[str, Sequence[EntryPoint]]:
 def origin_of(entry: EntryPoint) -> str:
     """Return the distribution of an entry point, with its version."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+
+
+@cache
+def own_packages() -> frozenset[str]:
+    """Return the names of the packages of our distribution: the core, and the bundled plugins."""
+    try:
+        entries = distribution(DISTRIBUTION).entry_points
+    except PackageNotFoundError:  # run from a folder
+        entries = EntryPoints()
+    return frozenset({"pano_mvs", *(entry.module.partition(".")[0] for entry in entries)})
 
 
 def is_bundled(entry: EntryPoint) -> bool:

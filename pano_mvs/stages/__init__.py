@@ -5,11 +5,9 @@ They are registered through the entry point `pano_mvs.plugins`, like stages of p
 
 from pano_mvs.stages.depth import exchange, full_size, known_floors, nearest, patchmatch, plain_surfaces, sweep
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
+from pano_mvs.stages.exports.colmap_lenses import colmap_lenses
 from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
-from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh, mesh_textured
-from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
-from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
 from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -21,7 +19,6 @@ from pano_mvs.stages.filters import (
     guided,
     median,
     planes,
-    prior,
     scale_planes,
     scale_ranges,
     scene_planes,
@@ -37,6 +34,5 @@ from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retr
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_localise import localise
-from pano_mvs.stages.rigs import colmap_lenses, dual_fisheye
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.weak_images import weak

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.consistency import checked_with_agreement
@@ -18,8 +18,6 @@ from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range, remove_speckles
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.learned.networks import Provider, open_network
-from pano_mvs.algorithms.learned.range_prior import fill_from_prior, network_values
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.sky import MAX_SOURCES, sky_pixels
 from pano_mvs.algorithms.patchmatch.exchange import respect_free_space
@@ -31,7 +29,6 @@ from pano_mvs.api import (
     All,
     Context,
     Each,
-    InputPath,
     Near,
     One,
     Panorama,
@@ -170,48 +167,6 @@ def structure(
     ctx.metric("on_planes", share)
     ctx.metric("completeness", float(result.valid.mean()))
     ctx.metric("consistent", float((result.confidence >= CONSISTENT_CONFIDENCE[0]).mean()))
-    return result
-
-
-@params_from(network_values, fill_from_prior, own_last=True)
-class PriorParams(Params):
-    """Settings of depth.prior."""
-
-    network: InputPath = Field(description="ONNX file of a network that estimates ranges from one panorama")
-    provider: Provider = Field(
-        default="cpu", description="what the network runs on; others than cpu need another package of ONNX Runtime"
-    )
-
-    @model_validator(mode="after")
-    def _is_usable(self) -> PriorParams:
-        open_network(self.network, self.provider).picture_input()
-        return self
-
-
-def _prior_memory(params: Params, inputs: Mapping[str, Any]) -> int:
-    """Return the memory of the alignment, and about that of a large network."""
-    return bytes_per_pixel(300)(params, inputs) + (2 << 30)
-
-
-@stage("depth.prior", memory=_prior_memory)
-def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams, ctx: Context) -> RangeMap:
-    """Fill what no view saw with the ranges of a neural network of your own, aligned to the ranges that views measured.
-
-    Such networks see one panorama. Their ranges are filled ones (confidence 3-63), never confirmed. Use it last, after
-    depth.structure. Where the network agrees with the measured ranges no better than a constant range would, the map
-    stays as it is.
-    """
-    picture = image.load()
-    network = open_network(params.network, params.provider)
-    values = network_values(network, picture, **arguments_from(network_values, params))
-    result, error = fill_from_prior(
-        range_map, picture, values, valid=image.load_mask(), **arguments_from(fill_from_prior, params)
-    )
-    if error == float("inf"):
-        ctx.note("the network's ranges do not agree with the measured ones, so that they are not used")
-    else:
-        ctx.metric("prior_error", error)
-    ctx.metric("completeness", float(result.valid.mean()))
     return result
 
 

@@ -41,7 +41,7 @@ from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.session.merging.merge import merge_outputs
 from tests.algorithms.blocks.walked_blocks import some_world
-from tests.hostile_names import HOSTILE_NAMES, LONG_NAMES
+from tests.hostile_names import HOSTILE_NAMES, LONG_NAMES, contents
 from tests.session.merging.written_blocks import SIZE_HW, write_block
 
 
@@ -154,6 +154,8 @@ _OTHERS = {  # readers of files that state names, with the test of them; the rea
     "io.rig_calibration.read_rig": "test_hostile_names_of_lenses_are_refused",
 }
 _NO_NAMES = {
+    *("pano_mvs_page.sharing.open_in_browser", "pano_mvs_queues.queues.read_queue"),
+    "pano_mvs_video.video_files.read_times",
     *(f"io.ply.{name}" for name in ("read_ply", "read_ply_mesh", "read_ply_points", "open_ply_points")),
     *(f"io.ranges.read_{name}" for name in ("range_tiff", "normals", "confidence_png", "npy")),
     *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map"),
@@ -181,12 +183,6 @@ def test_every_reader_is_here() -> None:
 
 _SEPARATE = {"pano_mvs_example", "pano_mvs_las", "pano_mvs_torch"}
 _READER = r"io\..*\.\w+_poses|.*\.((read|load|open)(_\w+)?|run_plans|keys_of_npz)"
-
-
-def contents(folder: Path) -> dict[str, bytes | None]:
-    """Return all files and folders below a folder, and the bytes of the files."""
-    found = sorted(folder.rglob("*"))
-    return {str(path): path.read_bytes() if path.is_file() else None for path in found}
 
 
 @pytest.fixture(scope="module")

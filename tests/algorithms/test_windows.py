@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from pano_mvs_floor_plan.evidence import range_view
 
-from pano_mvs.algorithms.floor_plan.evidence import range_view
 from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.view import ScenePlane, plane_ranges, plane_view
 from pano_mvs.algorithms.structure.windows import window_labels

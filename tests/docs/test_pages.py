@@ -21,7 +21,6 @@ from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.io.rig_calibration import MODELS, read_rig
 from pano_mvs.scene import FilePart
 from pano_mvs.stages.frame import ScaleParams
-from pano_mvs.stages.rigs import DualFisheyeParams
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Command, run_json
@@ -115,9 +114,11 @@ def test_the_calibration_file_of_the_page_can_be_read(tmp_path: Path) -> None:
 
 
 def test_defaults_on_the_page_are_those_of_the_stage() -> None:
-    defaults = DualFisheyeParams.model_validate({"path": "photos"})
-    assert f"`stitch_distance_m` ({defaults.stitch_distance_m:g} by default" in RIGS
-    assert f"`blend_deg` ({defaults.blend_deg:g})" in RIGS
+    defaults = (
+        Registry.installed().stages["source.dual_fisheye"].params_type.model_validate({"path": "photos"}).model_dump()
+    )
+    assert f"`stitch_distance_m` ({defaults['stitch_distance_m']:g} by default" in RIGS
+    assert f"`blend_deg` ({defaults['blend_deg']:g})" in RIGS
 
 
 def test_the_mask_on_the_page_keeps_the_contract(tmp_path: Path) -> None:

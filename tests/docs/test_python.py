@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -64,10 +65,10 @@ def test_the_notebook_runs(
     (shared,) = [value for value in shown if isinstance(value, pano_mvs.Shared)]
     assert (shared.points, shared.panoramas) == (100_000, 4)
     assert len(shared._repr_html_()) < 10_000_000
-    figures = [mpl.pyplot.figure(number) for number in mpl.pyplot.get_fignums()]
+    figures = [plt.figure(number) for number in plt.get_fignums()]
     assert len(figures) == 2
     assert len(figures[0].axes[0].images) == 1
-    mpl.pyplot.close("all")
+    plt.close("all")
     assert names["run"].poses.names == tuple(names["run"].views)
     exec(block("python.md", "points"), names)
     points = names["points_in_world"](names["view"])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_floor_plan_stage import the_cloud, the_poses
 
 import pano_mvs
 from pano_mvs.api import Context, InputError, PointCloud, Poses, UsageError
@@ -34,9 +35,8 @@ from pano_mvs.stages.filters import ScaleRangesParams, scale_planes, scale_range
 from pano_mvs.stages.frame import ScaleParams, scale
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
-from tests.algorithms.floor_plan_rooms import room_cloud
 from tests.io.test_ply import vertices
-from tests.stages.test_floor_plan import the_cloud, the_poses
+from tests.synthetic.floor_plan_rooms import room_cloud
 
 WORKFLOW = """
 pano_mvs: 1

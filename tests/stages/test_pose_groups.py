@@ -13,6 +13,8 @@ import numpy as np
 import pycolmap
 import pytest
 from pano_mvs_evaluation.stages import TruthParams, truth
+from pano_mvs_splats.nerfstudio import NerfstudioParams, nerfstudio
+from pano_mvs_splats.splat_bundle import SplatBundleParams, splat_bundle
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
@@ -36,8 +38,6 @@ from pano_mvs.stages.exports.colmap import (
     colmap_dense_init,
 )
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
-from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
-from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import tracked, vote

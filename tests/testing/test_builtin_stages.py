@@ -15,7 +15,7 @@ from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, Splat
 from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.algorithms.learned.grey_network import GREY_NETWORK
-from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
+from tests.synthetic.rig_images import tiny_rig_capture, tiny_rig_panorama
 from tests.synthetic.tour_files import tiny_tour
 from tests.synthetic.video_files import tiny_video
 

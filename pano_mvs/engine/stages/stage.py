@@ -14,6 +14,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar, Union, get_args, get_origin
 
+from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.core.settings import settings_of
@@ -172,8 +173,8 @@ class StageSpec:
 
     @property
     def is_built_in(self) -> bool:
-        """Whether the stage is part of this package, and not of a plugin."""
-        return self.function.__module__.partition(".")[0] == "pano_mvs"
+        """Whether the stage is one of the core or of a bundled plugin."""
+        return self.function.__module__.partition(".")[0] in own_packages()
 
     @property
     def index_kind(self) -> type[Record] | None:

@@ -20,6 +20,7 @@ from typing import TypeAlias
 
 import pano_mvs
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import checked_body, write_checked
 from pano_mvs.core.kernel_cache import user_cache_folder
@@ -135,14 +136,14 @@ def _code_of(path: Path, own_digest: str) -> tuple[str, frozenset[str]]:
     files, outer = dict(found.files), set(found.outer)
     roots = _Roots.of(path.resolve())
     if roots.package != _OURS:
-        if roots.package is not None and not own_digest:
+        if roots.package is not None and not own_digest and roots.package.name not in own_packages():
             outer.add(roots.package.name)  # its version stands for its compiled modules
         ours = _Roots(None, _OURS)
         inner = _Code()
         inner.collect([file for name in outer for file in ours.files(name)], ours)
         files |= inner.files
         outer |= inner.outer
-    libraries = {name.partition(".")[0] for name in outer} - {_OURS.name} - sys.stdlib_module_names
+    libraries = {name.partition(".")[0] for name in outer} - own_packages() - sys.stdlib_module_names
     _keep_parsed()
     return digest_from_value([own_digest, files]), frozenset(libraries)
 

@@ -406,10 +406,11 @@ def _repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) ->
 
 
 def _is_repeated(spec: StageSpec) -> bool:
-    """Return whether an export is one of this package and needs nothing but the cloud and the poses."""
-    is_own = spec.function.__module__.startswith("pano_mvs.stages.")
+    """Return whether an export is built in and needs nothing but the cloud and the poses."""
     needed = [port for port in spec.ports if not port.optional or port.kind in (PointCloud, Poses)]
-    return is_own and all(port.cardinality is Cardinality.ONE and port.kind in (PointCloud, Poses) for port in needed)
+    return spec.is_built_in and all(
+        port.cardinality is Cardinality.ONE and port.kind in (PointCloud, Poses) for port in needed
+    )
 
 
 def _export(

@@ -45,7 +45,7 @@ from pano_mvs.scene.masking import nearest_pixels
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surfaces import TrackedPoints
-from pano_mvs.stages.rigs import lens_rig_files
+from pano_mvs.stages.exports.colmap_lenses import lens_rig_files
 
 
 class ModelParams(Params):

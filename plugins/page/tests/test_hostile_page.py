@@ -23,7 +23,7 @@ from pano_mvs.io.ranges import write_range_tiff
 from pano_mvs.results.run_output import load
 from pano_mvs.scene.image_file import write_png
 from tests.browsers.browser import Browser, open_browser
-from tests.session.merging.test_hostile_outputs import contents
+from tests.hostile_names import contents
 from tests.synthetic.box_run import NAMES, box_mesh, box_run
 from tests.synthetic.viewed_scenes import SIZE_HW, box_cloud
 

@@ -7,9 +7,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
-
 import pano_mvs_page
+import pytest
 
 LOADER = Path(pano_mvs_page.__file__).parent / "web" / "loader.js"
 PAGE = """

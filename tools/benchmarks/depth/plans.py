@@ -31,13 +31,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pano_mvs_floor_plan.stages import FloorPlanParams, floor_plan
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Files, PointCloud, RangeMap
 from pano_mvs.scene.surfaces import Structure
-from pano_mvs.stages.exports.floor_plan import FloorPlanParams, floor_plan
 from tools.benchmarks.captures import SCRATCH, Capture, read_capture
 from tools.benchmarks.dense_chain import DenseChain, context, true_poses, with_true_points
 from tools.benchmarks.depth.houses import read_house

@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pano_mvs_rigs.camera import calibrate_camera
 
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
@@ -35,7 +36,6 @@ from pano_mvs.geometry import (
 from pano_mvs.io.rig_calibration import calibration_text
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.session.calibrating import calibrate_camera
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
 from tests.synthetic.fisheye_rig import render_lens
 from tests.synthetic.places import window_room, yard

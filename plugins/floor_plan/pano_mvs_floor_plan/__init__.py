@@ -1,0 +1,1 @@
+"""Floor plans: rooms, walls and openings of each storey, as drawings."""

@@ -1,0 +1,308 @@
+"""Export of floor plans."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from pano_mvs.algorithms.points.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
+from pano_mvs.api import (
+    All,
+    Context,
+    Files,
+    One,
+    Params,
+    PointCloud,
+    Poses,
+    RangeMap,
+    chunks,
+    split_groups,
+    stage,
+    write_png,
+)
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.paths import children
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene.surfaces import Structure
+from pano_mvs.scene.upright import world_up, z_up_from_world
+from pano_mvs_floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
+from pano_mvs_floor_plan.plan_drawings import (
+    DXF_REMEDY,
+    PlanDrawing,
+    draw_plan,
+    has_ezdxf,
+    strip_px,
+    svg_text,
+    world_file_text,
+    write_dxf,
+)
+from pano_mvs_floor_plan.wall_lines import Line
+from pano_mvs_floor_plan.walls_and_openings import plan_storey
+
+Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
+
+_EDGE_QUANTILE = 0.01
+_MARGIN = 0.03
+_MAX_SIDE_PX = 4096
+
+
+class FloorPlanParams(Params):
+    """Settings of export.floor_plan."""
+
+    formats: tuple[Literal["png", "svg", "dxf"], ...] = Field(
+        default=("png", "svg"), min_length=1, description="png with world file, svg and dxf of the wall lines"
+    )
+    width_px: int = Field(
+        default=1600, ge=100, le=_MAX_SIDE_PX, description="longer side of the plan in pixels, if `pixel` is 0"
+    )
+    pixel: float = Field(default=0.0, ge=0, description="edge of a pixel in scene units; 0: by `width_px`")
+    cut: float = Field(default=0.9, gt=0, le=2, description="height of the cut of the orthophoto, in camera heights")
+    min_wall_share: float = Field(
+        default=0.4,
+        gt=0,
+        le=1,
+        description="share of the height of the room that a wall must show, over 15 % of it along",
+    )
+    min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
+
+    @field_validator("formats")
+    @classmethod
+    def _can_be_written(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        if "dxf" in formats and not has_ezdxf():
+            raise ValueError(DXF_REMEDY)
+        return tuple(dict.fromkeys(formats))
+
+
+def plan_memory_bytes(params: FloorPlanParams, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for the grids of one storey, 40 bytes a pixel, for what cameras see, and parts of the cloud."""
+    return (
+        500_000_000
+        + 500_000 * len(inputs["poses"].names)
+        + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+    )
+
+
+@stage("export.floor_plan", memory=plan_memory_bytes)
+def floor_plan(
+    cloud: One[PointCloud],
+    poses: One[Poses],
+    ranges: All[RangeMap] | None,
+    planes: One[Structure] | None,
+    params: FloorPlanParams,
+    ctx: Context,
+) -> Files:
+    """Write plans of all storeys: floor_plan/storey_0.png with .pgw, storey_0.svg …, and floor_plan.json about them.
+
+    Rooms are those in which a camera stands; their outlines are closed, and lie on lines of walls. The PNG shows the
+    floor from above, cut below the cameras, with the walls, doors and windows, cameras and a scale bar. The coordinates
+    are those of cloud.ply: z up. Without range maps, the cloud alone shows the walls. The cloud is read in chunks:
+    memory does not grow with its size. Further groups of poses, each in its own frame, are in floor_plan_1/,
+    floor_plan_2/ …
+    """
+    files: dict[str, Path] = {}
+    walls = rooms = storeys = 0
+    for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
+        which = f"group {number}: " if poses.other_worlds else ""
+        kept = int((group.view_counts >= params.min_views).sum())
+        known = ranges if ranges and any(name in ranges for name in own.names) else {}
+        if kept < 100 and not known:
+            ctx.note(f"{which}no floor plan: {kept} points of the cloud are seen from {params.min_views} views")
+            continue
+        folder = f"floor_plan_{number}" if number else "floor_plan"
+        (ctx.scratch / folder).mkdir()
+        plan = _GroupPlan(group, own, params, ranges=known, planes=planes, number=number, folder=ctx.scratch / folder)
+        about = plan.write()
+        (ctx.scratch / folder / "floor_plan.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
+        files |= {f"{folder}/{path.name}": path for path in children(ctx.scratch / folder)}
+        for note in plan.notes:
+            ctx.note(f"{which}{note}")
+        storeys += len(about["storeys"])
+        walls += sum(len(entry["walls"]) for entry in about["storeys"])
+        rooms += sum(len(entry["rooms"]) for entry in about["storeys"])
+    ctx.metric("storeys", storeys)
+    ctx.metric("rooms", rooms)
+    ctx.metric("walls", walls)
+    return Files(files)
+
+
+class _GroupPlan:
+    """The plans of one group."""
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        poses: Poses,
+        params: FloorPlanParams,
+        *,
+        ranges: All[RangeMap],
+        planes: Structure | None,
+        number: int,
+        folder: Path,
+    ) -> None:
+        self.cloud = cloud
+        self.poses = poses
+        self.params = params
+        self.folder = folder
+        self.turn = z_up_from_world(world_up(poses))
+        self.centers = poses.centers @ self.turn.T
+        self.notes: list[str] = []
+        self.known = _lines(planes, number, self.turn)
+        self.view = self._views(ranges)
+
+    def write(self) -> dict[str, Any]:
+        """Write the files of all storeys, and return what floor_plan.json states."""
+        # Copies: parts of arrays would hold all of them.
+        views = map(self.view, range(len(self.poses.names)))
+        sampled = [(one.points[::16].copy(), one.normals[::16].copy()) for one in views]
+        points, normals = (np.concatenate(parts) for parts in zip(*sampled, strict=True))
+        storeys = find_storeys(points[:, 2], normals[:, 2], self.centers[:, 2])
+        extent = self._extent([points[:, :2] for points, _ in sampled if len(points)])
+        entries = [self._storey(number, storey, extent) for number, storey in enumerate(storeys)]
+        if not storeys:
+            self.notes.append("no floor plan: no view has confirmed ranges of surfaces")
+        if not all(storey.has_floor for storey in storeys):
+            self.notes.append("no level surface was found below some cameras: the floor of the plan is a guess")
+        return {
+            "unit": "metre" if self.poses.metric else "scene unit",
+            "frame": f"z up; x_in_plan = file_from_world x_in_world; world: {self.poses.frame}",
+            "file_from_world": self.turn.tolist(),
+            "storeys": entries,
+        }
+
+    def _views(self, ranges: All[RangeMap]) -> Callable[[int], PlanView]:
+        """Return a function that loads what a camera sees: its range map, or without any, what the cloud shows."""
+        plan_from_world = Rigid3(self.turn, np.zeros(3))
+        cams = [self.poses.cam_from_world(idx) @ plan_from_world.inverse() for idx in range(len(self.poses.names))]
+        if ranges:
+            nothing, nowhere = np.full((1, 2), np.nan), np.zeros((0, 3))
+            unseen = np.zeros((1, 2), np.bool_)
+            empty = PlanView(np.zeros(3), np.eye(3), nothing, nothing, nothing, unseen, nowhere, nowhere)
+            names = self.poses.names
+            return lambda idx: range_view(ranges[names[idx]], cams[idx]) if names[idx] in ranges else empty
+        views = CloudViews(cams)
+        for points, normals, _ in self._chunks():
+            views.add(points, normals)
+        return views.view
+
+    def _chunks(self) -> Iterator[Points]:
+        for chunk in chunks(len(self.cloud)):
+            kept = self.cloud.view_counts[chunk] >= self.params.min_views
+            points = self.cloud.points_in_world[chunk][kept].astype(np.float64) @ self.turn.T
+            normals = self.cloud.normals_in_world[chunk][kept].astype(np.float64) @ self.turn.T
+            yield points, normals, self.cloud.colors_rgb[chunk][kept]
+
+    def _extent(self, seen_xy: Sequence[FloatArray]) -> Extent:
+        """Return an extent with the cameras and most of what each of them sees, (N, 2) each."""
+        corners = [np.quantile(xy, [_EDGE_QUANTILE, 1 - _EDGE_QUANTILE], axis=0) for xy in seen_xy]
+        places = np.concatenate([self.centers[:, :2], *corners])
+        low, high = places.min(axis=0), places.max(axis=0)
+        side = max(float((high - low).max()), 1e-6)
+        low, high = low - _MARGIN * side, high + _MARGIN * side
+        side *= 1 + 2 * _MARGIN
+        pixel = self.params.pixel or side / self.params.width_px
+        if side / pixel > _MAX_SIDE_PX:
+            pixel = side / _MAX_SIDE_PX
+            self.notes.append(f"pixels of {self.params.pixel:g} would be too many; the plan has pixels of {pixel:.3g}")
+        columns, rows = np.maximum(1, np.ceil((high - low) / pixel)).astype(int).tolist()
+        return Extent(float(low[0]), float(high[1]), pixel, (rows, columns))
+
+    def _storey(self, number: int, storey: Storey, extent: Extent) -> dict[str, Any]:
+        """Write the files of one storey, and return its entry in floor_plan.json."""
+        heights = self.centers[list(storey.cameras), 2]
+        eyes = float(np.median(heights)) if len(heights) else storey.ceiling
+        photo = Orthophoto(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor))
+        for points, _, colors in self._chunks():
+            photo.add(points, colors)
+        side = extent.pixel * max(extent.size_hw)
+        evidence = Evidence(storey, extent.with_pixel(max(storey.height / 80, side / 1500)))
+        for idx in storey.cameras:
+            evidence.add(self.view(idx))
+        cameras = self.centers[list(storey.cameras), :2]
+        plan = plan_storey(
+            evidence,
+            self.known,
+            views=lambda: map(self.view, storey.cameras),
+            cameras=cameras,
+            min_share=self.params.min_wall_share,
+        )
+        places = self.centers[:, :2].tolist()
+        names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
+        rows, columns = extent.size_hw
+        width, height = columns * extent.pixel, rows * extent.pixel
+        bar = bar_length(width)
+        unit = "m" if self.poses.metric else "scene unit" if bar == 1 else "scene units"
+        box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
+        drawing = PlanDrawing(
+            f"storey {number}",
+            np.array([wall.ends for wall in plan.walls]).reshape(-1, 2, 2),
+            plan.solids,
+            [(opening.kind, opening.ends) for opening in plan.openings],
+            plan.rooms,
+            names,
+            box,
+            bar,
+            unit,
+            self.poses.metric,
+        )
+        files = self._write_files(f"storey_{number}", photo, drawing)
+        return {
+            **files,
+            "z_range": [storey.floor, storey.ceiling],
+            "has_floor": storey.has_floor,
+            "has_ceiling": storey.has_ceiling,
+            "units_per_pixel": extent.pixel,
+            "metres_per_pixel": extent.pixel if self.poses.metric else None,
+            "origin_xy": [extent.left, extent.top],
+            "size_px": [extent.size_hw[1], extent.size_hw[0] + strip_px(extent.size_hw)],
+            "plan_size_px": [extent.size_hw[1], extent.size_hw[0]],
+            "rooms": [
+                {
+                    "outline": room.outline.tolist(),
+                    "holes": [hole.tolist() for hole in room.holes],
+                    "area": room.area,
+                    "lengths": np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1).tolist(),
+                }
+                for room in plan.rooms
+            ],
+            "walls": [
+                {"ends": wall.ends.tolist(), "room": wall.room, "thickness": wall.thickness} for wall in plan.walls
+            ],
+            "openings": [{"kind": opening.kind, "ends": opening.ends.tolist()} for opening in plan.openings],
+            "cameras": {name: list(place) for name, place in names.items()},
+        }
+
+    def _write_files(self, stem: str, photo: Orthophoto, drawing: PlanDrawing) -> dict[str, str]:
+        """Write the files of a storey in all formats, and return their names."""
+        files: dict[str, str] = {}
+        extent = photo.extent
+        if "png" in self.params.formats:
+            files |= {"png": f"{stem}.png", "world_file": f"{stem}.pgw"}
+            write_png(self.folder / files["png"], draw_plan(*photo.picture(), drawing))
+            text = world_file_text(extent.pixel, extent.left, extent.top)
+            (self.folder / files["world_file"]).write_text(text, encoding="ascii")
+        if "svg" in self.params.formats:
+            files["svg"] = f"{stem}.svg"
+            (self.folder / files["svg"]).write_text(svg_text(drawing), encoding="utf-8")
+        if "dxf" in self.params.formats:
+            files["dxf"] = f"{stem}.dxf"
+            write_dxf(self.folder / files["dxf"], drawing)
+        return files
+
+
+def _lines(planes: Structure | None, group: int, turn: FloatArray) -> list[Line]:
+    """Return the lines of the upright planes of a group, in the plan."""
+    if planes is None:
+        return []
+    upright = (planes.group_idx == group) & (np.abs(planes.normals_in_world[:, 1]) < 0.5)
+    normals = (planes.normals_in_world[upright] @ turn.T)[:, :2]
+    lengths = np.linalg.norm(normals, axis=1)
+    return [
+        Line(normal / length, float(offset / length))
+        for normal, length, offset in zip(normals, lengths, planes.offsets[upright], strict=True)
+    ]

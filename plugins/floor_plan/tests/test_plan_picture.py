@@ -1,0 +1,36 @@
+"""The picture of a plan."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+from pano_mvs_floor_plan.plan_drawings import COLORS, PlanDrawing, draw_plan
+
+
+def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:
+    room = SimpleNamespace(outline=np.zeros((0, 2)), area=6.0, label_xy=np.array([1.0, 1.0]))
+    plan = PlanDrawing(
+        "plan",
+        np.array([[[0.5, 0.5], [3.5, 0.5]]]),
+        [np.array([[0.5, 1.8], [1.5, 1.8], [1.5, 1.6], [0.5, 1.6]])],
+        [("door", np.array([[2.5, 1.0], [3.0, 1.0]]))],
+        [room],
+        {"a.jpg": (2.0, 1.5)},
+        ((0.0, 0.0), (4.0, 2.0)),
+        1.0,
+        "m",
+        is_metric=True,
+    )
+    blank = np.zeros((200, 400, 3), np.uint8), np.zeros((200, 400), np.bool_)
+    picture = draw_plan(*blank, plan)
+    assert picture.shape == (236, 400, 3)
+    dark = picture.max(axis=-1) < 100
+    assert dark[149:151, 60:340].all(axis=1).any()
+    assert dark[25:35, 60:140].all()
+    assert picture[50, 200].tolist() == list(COLORS["camera"])
+    assert picture[100, 275].tolist() == list(COLORS["door"])
+    assert (picture[70:105, 60:140].max(axis=-1) < 200).any()  # the area
+    bar = np.flatnonzero(dark[200 + 18])
+    longest = max(np.split(bar, np.flatnonzero(np.diff(bar) > 1) + 1), key=len)
+    assert abs(len(longest) - 100) <= 3  # 1 m
