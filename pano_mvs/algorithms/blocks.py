@@ -8,11 +8,8 @@ from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.frame.gauge import moved_back
@@ -82,7 +79,7 @@ def _with_returns(
     # Images of two blocks are of one place if they are this near, in median steps of the path.
     reach = 1.5 * float(np.median(np.concatenate(steps))) if steps else 0.0
     found = [set(stretch) for stretch in stretches]
-    trees = [cKDTree(own) if len(own) else None for own in centers]
+    trees = [scipy.spatial.cKDTree(own) if len(own) else None for own in centers]
     for here, there in permutations(range(len(stretches)), 2):
         first, second = trees[there], trees[here]
         if first is None or second is None:
@@ -211,7 +208,7 @@ def similarity_from_cameras(source: Sequence[Rigid3], target: Sequence[Rigid3]) 
 
 def camera_spacing(centers: FloatArray) -> float:
     """Return the median distance between a camera and its nearest neighbour, of centres (N, 3)."""
-    apart = np.asarray(cKDTree(centers).query(centers, k=[2])[0])  # the nearest one is the camera itself
+    apart = np.asarray(scipy.spatial.cKDTree(centers).query(centers, k=[2])[0])  # the nearest one is the camera itself
     return max(float(np.median(apart)), 1e-12)
 
 
@@ -276,7 +273,7 @@ def _adjusted(
     extent = max(float(np.abs(start[a].apply(centers[0])).max()) for a, _, centers, _, _ in pairs)
     sizes = np.tile([1.0, 1.0, 1.0, 1.0, extent, extent, extent], len(free))
     # In median distances between neighbouring cameras.
-    solution = least_squares(
+    solution = scipy.optimize.least_squares(
         residuals, np.zeros(7 * len(free)), loss="cauchy", f_scale=0.02, x_scale=sizes, xtol=1e-12, ftol=1e-12
     )
     return unpacked(solution.x)
@@ -334,7 +331,7 @@ def owners_of(blocks: Sequence[Mapping[str, FloatArray]]) -> dict[str, int]:
         for name in block:
             homes.setdefault(name, []).append(number)
     own = [np.array([block[name] for name in block if len(homes[name]) == 1]).reshape(-1, 3) for block in blocks]
-    trees = [cKDTree(centers) if len(centers) else None for centers in own]
+    trees = [scipy.spatial.cKDTree(centers) if len(centers) else None for centers in own]
 
     def distance(number: int, name: str) -> float:
         tree = trees[number]
@@ -472,13 +469,15 @@ def _joined_points(found: _Observations) -> tuple[NDArray[np.intp], NDArray[np.i
         if len(of_image) > 1:
             # Two observations in one image within this angle are of the same point; patch alignment moves them
             # differently in different blocks.
-            close = cKDTree(found.bearings[of_image]).query_pairs(float(np.radians(0.03)), output_type="ndarray")
+            close = scipy.spatial.cKDTree(found.bearings[of_image]).query_pairs(
+                float(np.radians(0.03)), output_type="ndarray"
+            )
             pairs = found.point_idx[of_image][close]
             links.append(pairs[found.block_of_point[pairs[:, 0]] != found.block_of_point[pairs[:, 1]]])
     joined = np.concatenate(links) if links else np.zeros((0, 2), np.intp)
     count = len(found.points)
-    graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(count, count))
-    label = connected_components(graph, directed=False)[1].astype(np.intp)
+    graph = scipy.sparse.coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(count, count))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.intp)
     return label, label[found.point_idx]
 
 
@@ -487,4 +486,4 @@ def nearest_cameras(points: NDArray[np.floating[Any]], centers: FloatArray) -> N
 
     `points`: in the world. `centers`: (K, 3) of all cameras.
     """
-    return np.asarray(cKDTree(centers).query(points)[1], np.intp)
+    return np.asarray(scipy.spatial.cKDTree(centers).query(points)[1], np.intp)

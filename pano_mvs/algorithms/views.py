@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -57,7 +57,7 @@ def select_views(
 
 def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg: float) -> dict[str, tuple[str, ...]]:
     """Return the sources of the images of one group."""
-    distances = np.asarray(cdist(poses.centers, poses.centers), np.float64)
+    distances = np.asarray(scipy.spatial.distance.cdist(poses.centers, poses.centers), np.float64)
     scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
     others = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
     usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0

@@ -25,6 +25,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.endings import guarded
 from pano_mvs.core.doors import Door, RunOption
 from pano_mvs.core.errors import PanoMvsError, PluginError
+from pano_mvs.core.plugin_folders import plugin_files_in, user_plugin_folders
 
 Command = typer.Typer | Callable[..., None]
 Decorator = Callable[[Callable[..., None]], Callable[..., None]]
@@ -53,6 +54,13 @@ def register_command(name: str) -> Decorator:
 class PluginGroup(TyperGroup):
     """A group of commands to which plugins add; typer's own types of commands differ between its versions."""
 
+    _describes = False  # whether the help of the group is being made, which shows no options of its commands
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the group."""
+        self._describes = True
+        super().format_help(ctx, formatter)
+
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of the commands, those of plugins last."""
         own = super().list_commands(ctx)
@@ -65,7 +73,11 @@ class PluginGroup(TyperGroup):
         own: Any = super().get_command(ctx, cmd_name)
         if own is not None:
             options = getattr(own.callback, _OPTIONS, None)
-            return own if options is None else _command(_with_options(own.callback.__wrapped__, options()), cmd_name)
+            return (
+                own
+                if options is None or self._describes
+                else _command(_with_options(own.callback.__wrapped__, options()), cmd_name)
+            )
         full = f"{_prefix(ctx)}{cmd_name}"
         if full not in COMMANDS.names():
             load_files()
@@ -94,9 +106,9 @@ def _within(full: str, prefix: str) -> str:
 
 def load_files() -> None:
     """Import the files in the user's plugin folders, which register commands, executors and observers."""
-    from pano_mvs.engine.stages.registry import Registry, plugin_files_in, user_plugin_folders
-
     if any(plugin_files_in(folder) for folder in user_plugin_folders()):
+        from pano_mvs.engine.stages.registry import Registry
+
         Registry.installed()
 
 

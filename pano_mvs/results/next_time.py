@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural, shortened_list
@@ -38,7 +38,7 @@ class CameraGroup:
         if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
             return None
         count = len(centers)
-        found = cKDTree(centers).query(centers, k=min(count, 7))
+        found = scipy.spatial.cKDTree(centers).query(centers, k=min(count, 7))
         distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
         near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
         own = near == np.arange(count)[:, None]

@@ -120,7 +120,7 @@ def test_commands_start_where_the_home_folder_may_not_be_searched(tmp_path: Path
     code = """
 import os
 import pano_mvs.algorithms
-from pano_mvs.engine.stages.registry import plugin_files_in, user_plugin_folders
+from pano_mvs.core.plugin_folders import plugin_files_in, user_plugin_folders
 os.makedirs(os.environ["NUMBA_CACHE_DIR"])
 print([plugin_files_in(folder) for folder in user_plugin_folders()], os.environ["NUMBA_CACHE_DIR"])
 """

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.engine.stages.registry import Registry, plugin_files_in, user_plugin_folders
+from pano_mvs.core.plugin_folders import plugin_files_in, user_plugin_folders
+from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
 
 STAGE = """\

@@ -31,7 +31,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from pano_mvs_evaluation import ScoreSettings, evaluate_depth, evaluate_poses
+from pano_mvs_evaluation.poses import evaluate_poses
+from pano_mvs_evaluation.ranges.evaluate import evaluate_depth
+from pano_mvs_evaluation.ranges.view_scores import ScoreSettings
 
 import pano_mvs
 from pano_mvs.scene import Poses

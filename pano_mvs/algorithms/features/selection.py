@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting
@@ -27,7 +27,7 @@ def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, rad
         return order
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    pairs = cKDTree(bearings).query_pairs(2 * np.sin(radius_rad / 2), output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(bearings).query_pairs(2 * np.sin(radius_rad / 2), output_type="ndarray")
     weaker, stronger = np.sort(rank[pairs], axis=1)[:, ::-1].T
     kept = np.ones(len(order), np.bool_)
     # In order of strength of the weaker one, so that the decision on the stronger one has already been made.
@@ -57,7 +57,7 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
     azimuth = np.pi * (1 + np.sqrt(5)) * idx
     radius = np.sqrt(1 - y**2)
     cells = np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)
-    cell = np.asarray(cKDTree(cells).query(bearings[order])[1], np.intp)
+    cell = np.asarray(scipy.spatial.cKDTree(cells).query(bearings[order])[1], np.intp)
     by_cell = np.argsort(cell, kind="stable")
     first_of_cell = np.searchsorted(cell[by_cell], np.arange(len(cells)))
     rank = np.empty(len(order), np.intp)

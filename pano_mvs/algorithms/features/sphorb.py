@@ -14,8 +14,8 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from pano_mvs.algorithms.faces.layout import face_corners
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
@@ -358,7 +358,7 @@ def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[
         S arrays (H, W) uint8.
     """
     height, width = panorama.shape
-    spectrum = fft.rfft(panorama.astype(np.float32), axis=1)
+    spectrum = scipy.fft.rfft(panorama.astype(np.float32), axis=1)
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
     frequency = np.arange(spectrum.shape[1]) * (2 * np.pi / width)
     cosine = np.cos(elevation)[:, None]
@@ -367,7 +367,7 @@ def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[
         pixel_std = np.sqrt(1 / 12)  # of a box one pixel wide
         spread = (sigma_px**2 + (pixel_std * np.sin(elevation[:, None])) ** 2) / cosine**2
         decay = np.exp(-0.5 * spread * frequency**2).astype(np.float32)
-        rows = fft.irfft(spectrum * decay, n=width, axis=1)
+        rows = scipy.fft.irfft(spectrum * decay, n=width, axis=1)
         smoothed.append(np.rint(_smooth_columns(rows, float(sigma_px))).clip(0, 255).astype(np.uint8))
     return smoothed
 

@@ -21,8 +21,7 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.data_term import Domain, MaxHoleDeg, data_term, require_guide
@@ -352,6 +351,8 @@ def _blind_guess(target: FloatArray, weight: FloatArray, cells: SphereCells) -> 
 
     It is the mean of the targets in each cell, extended to empty cells by Laplace's equation on the cells' graph.
     """
+    from scipy.sparse.linalg import spsolve
+
     count = len(cells.starts) - 1
     element = cells.element_of_pixel[cells.gap_of_row]
     cell = cells.corners[element, 0]
@@ -361,6 +362,6 @@ def _blind_guess(target: FloatArray, weight: FloatArray, cells: SphereCells) -> 
     pull = 1e3 * total_weight / total_weight.max()
     mean = total / np.where(total_weight > 0, total_weight, 1)
     matrix = scipy.sparse.diags_array(pull + graph.sum(axis=1)) - graph
-    guess: FloatArray = np.asarray(scipy.sparse.linalg.spsolve(matrix.tocsc(), pull * mean), np.float64)
+    guess: FloatArray = np.asarray(spsolve(matrix.tocsc(), pull * mean), np.float64)
     spread: FloatArray = guess[cell]
     return spread

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from pano_mvs.algorithms.filters.data_term import MaxHoleDeg
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
@@ -69,7 +69,7 @@ def rim(inside: Mask) -> Mask:
 
 def _distances(rays: NDArray[np.float64], goals: Mask, starts: Mask, *, reach: float) -> NDArray[np.float64]:
     """Return the chord from each start to the nearest goal, (N,); inf if it is longer than `reach`."""
-    tree = KDTree(rays[goals], balanced_tree=False, compact_nodes=False)
+    tree = scipy.spatial.KDTree(rays[goals], balanced_tree=False, compact_nodes=False)
     return np.asarray(tree.query(rays[starts], distance_upper_bound=reach * (1 + 1e-12))[0], np.float64)
 
 

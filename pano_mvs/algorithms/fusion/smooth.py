@@ -7,8 +7,8 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.bands import for_bands
@@ -38,7 +38,7 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     if cloud.uncertainty is None or len(cloud) == 0:
         return cloud
     points, normals = np.ascontiguousarray(cloud.points_in_world), np.ascontiguousarray(cloud.normals_in_world)
-    tree, distances = cKDTree(centers), np.empty(len(points), np.float32)
+    tree, distances = scipy.spatial.cKDTree(centers), np.empty(len(points), np.float32)
     for part in _parts(len(points)):
         distances[part] = tree.query(points[part])[0]
     # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.

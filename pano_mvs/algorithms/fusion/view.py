@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.panoramas import columns_per_step
@@ -117,7 +117,9 @@ def nearest_views(poses: Sequence[Rigid3], count: int) -> list[list[int]]:
         return [[other for other in range(len(poses)) if other != idx] for idx in range(len(poses))]
     centers = np.array([pose.center for pose in poses])
     # A list of ranks, because for k=1 the query drops an axis.
-    distances, found = (np.asarray(values) for values in cKDTree(centers).query(centers, k=list(range(1, count + 2))))
+    distances, found = (
+        np.asarray(values) for values in scipy.spatial.cKDTree(centers).query(centers, k=list(range(1, count + 2)))
+    )
     nearest = []
     for idx in range(len(poses)):
         others = [(distance, other) for distance, other in zip(distances[idx], found[idx], strict=True) if other != idx]

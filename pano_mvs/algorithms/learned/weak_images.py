@@ -6,8 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order
+import scipy
 
 from pano_mvs.algorithms.matching.pair_selection import similarities
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
@@ -90,13 +89,13 @@ def _without_bridges(edges: Collection[tuple[int, int]], count: int) -> list[tup
     one side of it: the exclusive or of the numbers at the nodes below it is 0 only if there are none.
     """
     ends = np.array(sorted({(min(edge), max(edge)) for edge in edges}), np.intp).reshape(-1, 2)
-    graph = csr_array(coo_array((np.ones(len(ends), np.int8), ends.T), (count, count)))
+    graph = scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(len(ends), np.int8), ends.T), (count, count)))
     above = np.full(count, -1)
     below: list[int] = []
     seen = np.zeros(count, np.bool_)
     for root in range(count):
         if not seen[root]:
-            order, before = breadth_first_order(graph, root, directed=False)
+            order, before = scipy.sparse.csgraph.breadth_first_order(graph, root, directed=False)
             seen[order] = True
             above[order[1:]] = before[order[1:]]
             below += order[1:].tolist()

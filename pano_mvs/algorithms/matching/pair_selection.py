@@ -7,9 +7,8 @@ from itertools import combinations
 from typing import Annotated
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pano_mvs.algorithms.matching.nearest_two import Comparable
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
@@ -217,7 +216,7 @@ def _joined(links: NDArray[np.intp], distances: FloatArray) -> NDArray[np.intp]:
     cost = distances - distances.min() + distances.max() + 1.0
     np.fill_diagonal(cost, 0)
     cost[links[:, 0], links[:, 1]] = cost[links[:, 1], links[:, 0]] = 1e-3
-    tree = minimum_spanning_tree(csr_array(np.triu(cost))).tocoo()
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_array(np.triu(cost))).tocoo()
     joined = np.stack([np.minimum(tree.row, tree.col), np.maximum(tree.row, tree.col)], axis=1)
     return np.unique(np.concatenate([links, joined]), axis=0)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import hadamard
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
@@ -81,6 +81,6 @@ def _turned(vectors: FloatArray) -> FloatArray:
     size = 1 << max(vectors.shape[1] - 1, 1).bit_length()
     rng = np.random.default_rng(20261121)  # arbitrary but fixed, so that images can be compared
     signs = rng.choice([-1.0, 1.0], size)[: vectors.shape[1]]
-    rows = hadamard(size, dtype=np.float64)[: vectors.shape[1]]
+    rows = scipy.linalg.hadamard(size, dtype=np.float64)[: vectors.shape[1]]
     turned: FloatArray = (vectors * signs) @ rows[:, rng.permutation(size)]
     return turned

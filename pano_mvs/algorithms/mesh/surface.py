@@ -9,10 +9,8 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.mesh.view_quality import face_normals
 from pano_mvs.algorithms.mesh.volume import Surface
@@ -37,7 +35,7 @@ def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:
     At most ten times the cloud's median.
     """
     count = min(_NEIGHBOURS + 1, len(points))
-    distances, _ = cKDTree(points).query(points, k=count)
+    distances, _ = scipy.spatial.cKDTree(points).query(points, k=count)
     spacings: NDArray[np.float64] = np.median(np.asarray(distances)[:, 1:], axis=1)
     # Otherwise a stray point, far from all others, would keep a large bubble around it.
     return np.asarray(np.minimum(spacings, 10.0 * np.median(spacings)))
@@ -52,7 +50,7 @@ def trimmed_mesh(mesh: Mesh, points: NDArray[np.float32], *, max_spacings: float
     `mesh`: the mesh. `points`: (N, 3) in the world from which the mesh was made, more than one. `max_spacings`: maximum
     distance in point spacings; holes narrower than twice this distance stay closed.
     """
-    distances, nearest = cKDTree(points).query(mesh.vertices_in_world)
+    distances, nearest = scipy.spatial.cKDTree(points).query(mesh.vertices_in_world)
     near = distances <= max_spacings * point_spacings(points)[nearest]
     return used_part(mesh, mesh.faces[near[mesh.faces].all(axis=1)])
 
@@ -61,8 +59,8 @@ def without_crumbs(mesh: Mesh, *, smallest_share: float) -> Mesh:
     """Return a mesh without connected parts that have less than a given share of all its triangles."""
     count = len(mesh.vertices_in_world)
     starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    edges = coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
-    _, part_of_vertex = connected_components(edges, directed=False)
+    edges = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
+    _, part_of_vertex = scipy.sparse.csgraph.connected_components(edges, directed=False)
     part = part_of_vertex[mesh.faces[:, 0]]
     kept = np.bincount(part, minlength=1)[part] >= smallest_share * len(part)
     return used_part(mesh, mesh.faces[kept])

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
 from pano_mvs.algorithms.mesh.view_quality import PaintView, face_normals, pixel_quality, surface_view
@@ -42,7 +42,7 @@ def filled_colors(colors: FloatImage, seen: NDArray[np.bool_], places: Places) -
         colors[:] = 128.0
         return
     known = known[:: -(-len(known) // _SAMPLES)]
-    tree = cKDTree(places(known))
+    tree = scipy.spatial.cKDTree(places(known))
     hidden = np.flatnonzero(~seen)
     for first in range(0, len(hidden), _TEXELS_OF_PART):
         part = hidden[first : first + _TEXELS_OF_PART]

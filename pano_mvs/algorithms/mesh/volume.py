@@ -15,9 +15,8 @@ from itertools import product
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import coo_array, csr_array
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.mesh.view_quality import face_normals, surface_view
@@ -133,9 +132,9 @@ class Volume:
         """Give cells where nothing was measured the mean of what was measured around them, from near to far."""
         for size in _GAPS:
             known = (self.weights > 0).astype(np.float32)
-            around = ndimage.uniform_filter(known, size, mode="constant")
+            around = scipy.ndimage.uniform_filter(known, size, mode="constant")
             gaps = (known == 0) & (around > 0.25)
-            means = ndimage.uniform_filter(self.distances * known, size, mode="constant")
+            means = scipy.ndimage.uniform_filter(self.distances * known, size, mode="constant")
             self.distances[gaps] = means[gaps] / around[gaps]
             self.weights[gaps] = np.finfo(np.float32).tiny
 
@@ -317,11 +316,11 @@ def plane_of_faces(surface: Surface, planes: Planes, *, tolerance: float) -> NDA
     return found
 
 
-def adjacency(faces: NDArray[np.int32], count: int) -> csr_array:
+def adjacency(faces: NDArray[np.int32], count: int) -> scipy.sparse.csr_array:
     """Return which vertices are linked by an edge, (count, count), 1 for an edge."""
     starts, ends = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     both = np.concatenate([starts, ends]), np.concatenate([ends, starts])
-    links = coo_array((np.ones(2 * len(starts), np.float32), both), shape=(count, count)).tocsr()
+    links = scipy.sparse.coo_array((np.ones(2 * len(starts), np.float32), both), shape=(count, count)).tocsr()
     links.data[:] = 1
     return links
 
@@ -339,10 +338,10 @@ def _closed(seen: Mask, radius: int) -> Mask:
     padded = np.pad(seen, radius + 1)
     if not seen.any():
         return seen
-    grown = ndimage.distance_transform_edt(~padded) <= radius
-    closed = ndimage.distance_transform_edt(grown) > radius
+    grown = scipy.ndimage.distance_transform_edt(~padded) <= radius
+    closed = scipy.ndimage.distance_transform_edt(grown) > radius
     inner = slice(radius + 1, -radius - 1)
-    return np.asarray(ndimage.binary_fill_holes(closed | padded)[inner, inner])
+    return np.asarray(scipy.ndimage.binary_fill_holes(closed | padded)[inner, inner])
 
 
 def _quads(inside: Mask, number: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.core.arrays import FloatArray
 
@@ -99,7 +99,7 @@ def _levels(heights: FloatArray, step: float) -> list[float]:
         return []
     start = float(heights.min())
     counts = np.bincount(((heights - start) / step).astype(np.int64)).astype(np.float64)
-    density = gaussian_filter1d(np.pad(counts, 4), 1.5, mode="constant")
+    density = scipy.ndimage.gaussian_filter1d(np.pad(counts, 4), 1.5, mode="constant")
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]))
     strong = peaks[density[peaks] >= 0.25 * density.max()]

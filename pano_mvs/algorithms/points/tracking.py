@@ -8,8 +8,8 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP, pixels_containing
 from pano_mvs.core.arrays import FloatArray
@@ -175,7 +175,7 @@ def _track_group(
     if not len(candidates.points):
         return _tracked(names, candidates, _joined([]), kept=np.zeros(0, np.intp))
     centers = poses.centers[pose_idx]
-    tree = cKDTree(centers)
+    tree = scipy.spatial.cKDTree(centers)
     # Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So
     # the distance of neighbouring points is proportional to the square root of the distance to the nearest camera.
     spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** 0.5
@@ -224,7 +224,7 @@ def _candidates(
     return _Candidates(np.concatenate(points), np.concatenate(homes), np.concatenate(colors))
 
 
-def _asked(tree: cKDTree, chosen: _Candidates, neighbours: int) -> list[NDArray[np.intp]]:
+def _asked(tree: scipy.spatial.cKDTree, chosen: _Candidates, neighbours: int) -> list[NDArray[np.intp]]:
     """Return for each view the points to test: those for which it is among the nearest views, and its own."""
     # A list of ranks, because for k=1 the query drops an axis.
     nearest = np.asarray(tree.query(chosen.points, k=list(range(1, neighbours + 1)))[1])
@@ -357,7 +357,7 @@ def _discs(
     """Return points of which no two are closer than the smaller of their discs' radii."""
     order = rng.permutation(len(points))
     ranks = list(range(2, min(16, len(points)) + 1))  # points are on surfaces, where no more fit around one
-    distance, neighbour = (np.asarray(found) for found in cKDTree(points).query(points, k=ranks))
+    distance, neighbour = (np.asarray(found) for found in scipy.spatial.cKDTree(points).query(points, k=ranks))
     first = np.repeat(np.arange(len(points)), distance.shape[1])
     second = neighbour.ravel()
     width = distance.ravel() / np.minimum(spacing[first], spacing[second])

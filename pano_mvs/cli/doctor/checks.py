@@ -20,9 +20,10 @@ from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
 from pano_mvs.core.memory import free_memory_bytes, size_text
 from pano_mvs.core.paths import below, children, is_folder
+from pano_mvs.core.plugin_folders import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.stages.registry import PLUGINS_VARIABLE, Registry, plugin_files_in, user_plugin_folders
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 State: TypeAlias = Literal["ok", "note", "warning", "failed"]

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import sys
 import traceback
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -21,7 +20,8 @@ from types import ModuleType
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
-from pano_mvs.core.paths import children, home_folder, is_file, resolved
+from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.plugin_folders import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import error_text, shortened
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
@@ -275,34 +275,3 @@ def _where(error: BaseException, path: Path) -> str:
     deeper = own and own[-1] is not frames[-1] and "importlib" not in frames[-1].filename
     text = f"{place}{type(error).__name__}: {error_text(error)}"
     return f"{text}\n{_trace(error).rstrip()}" if deeper else text
-
-
-PLUGINS_VARIABLE = "PANO_MVS_PLUGINS"
-
-
-def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Path]:
-    """Return the folders of the user's plugins: those in $PANO_MVS_PLUGINS, or else the one among the user's settings.
-
-    The variable holds folders separated as in PATH; if it is empty, there are none. Without the variable the folder is
-    `pano-mvs/plugins` in $XDG_CONFIG_HOME or ~/.config (Linux), ~/Library/Application Support (macOS), or %APPDATA%
-    (Windows). Relative folders depend on where the command is run; the caller must refuse them.
-    """
-    variable = environment.get(PLUGINS_VARIABLE)
-    if variable is not None:
-        return [Path(folder) for folder in variable.split(os.pathsep) if folder]
-    home = home_folder()
-    if sys.platform == "win32":
-        given = Path(environment.get("APPDATA") or "")
-        settings = given if given.is_absolute() else home and home / "AppData" / "Roaming"
-    elif sys.platform == "darwin":
-        settings = home and home / "Library" / "Application Support"
-    else:
-        given = Path(environment.get("XDG_CONFIG_HOME") or "")
-        settings = given if given.is_absolute() else home and home / ".config"
-    return [] if settings is None else [settings / "pano-mvs" / "plugins"]
-
-
-def plugin_files_in(folder: Path) -> list[Path]:
-    """Return the plugin files in a folder, by name: all Python files except tests and names that begin with _."""
-    files = children(folder, "*.py")
-    return [file for file in files if not file.name.startswith(("_", ".", "test_")) and file.name != "conftest.py"]

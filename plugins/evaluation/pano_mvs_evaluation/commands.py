@@ -53,7 +53,7 @@ def run(
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of them.")],
 ) -> None:
     """Compare the poses, range maps and cloud of a run with ground truth, as far as available."""
-    from pano_mvs_evaluation import evaluate_run
+    from pano_mvs_evaluation.capture import evaluate_run
     from pano_mvs_evaluation.printing import print_run
 
     print_run(evaluate_run(out, truth), Console())
@@ -67,7 +67,7 @@ def poses(
     as_json: JsonOption = False,
 ) -> None:
     """Compare poses with ground truth, regardless of their frames and units."""
-    from pano_mvs_evaluation import evaluate_poses
+    from pano_mvs_evaluation.poses import evaluate_poses
     from pano_mvs_evaluation.printing import print_summary
 
     evaluation = evaluate_poses(model, truth)
@@ -102,7 +102,8 @@ def cloud(
     as_json: JsonOption = False,
 ) -> None:
     """Compare a cloud with ground truth: accuracy, completeness, F-score."""
-    from pano_mvs_evaluation import evaluate_cloud, write_error_clouds, write_overview
+    from pano_mvs_evaluation.clouds.evaluate import evaluate_cloud
+    from pano_mvs_evaluation.clouds.pictures import write_error_clouds, write_overview
     from pano_mvs_evaluation.printing import print_summary
 
     evaluation = evaluate_cloud(cloud, truth, poses=poses, true_poses=true_poses, thresholds=thresholds)
@@ -183,16 +184,11 @@ class DepthArguments:
 @takes_record
 def depth(given: DepthArguments) -> None:
     """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
-    from pano_mvs_evaluation import (
-        BadLimit,
-        ScoreSettings,
-        depth_summary,
-        evaluate_depth,
-        write_depth_csv,
-        write_depth_pictures,
-        write_depth_scores,
-    )
     from pano_mvs_evaluation.printing import print_summary
+    from pano_mvs_evaluation.ranges.error_picture import write_depth_pictures
+    from pano_mvs_evaluation.ranges.evaluate import evaluate_depth
+    from pano_mvs_evaluation.ranges.tables import depth_summary, write_depth_csv, write_depth_scores
+    from pano_mvs_evaluation.ranges.view_scores import BadLimit, ScoreSettings
 
     settings = ScoreSettings(
         given.peak, tuple(BadLimit.from_text(text) for text in given.bad or ["5%"]), given.align, given.min_confidence

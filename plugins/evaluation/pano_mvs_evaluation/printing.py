@@ -9,7 +9,8 @@ from rich.table import Table
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_scores
 from pano_mvs.results.records import ScoresSummary
-from pano_mvs_evaluation import RunEvaluation, depth_summary
+from pano_mvs_evaluation.capture import RunEvaluation
+from pano_mvs_evaluation.ranges.tables import depth_summary
 from pano_mvs_evaluation.tables import Summary, TextTable
 
 

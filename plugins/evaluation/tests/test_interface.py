@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_evaluation import RunEvaluation, evaluate_cloud, evaluate_depth, evaluate_poses
-from pano_mvs_evaluation.capture import score_capture
+from pano_mvs_evaluation.capture import RunEvaluation, score_capture
+from pano_mvs_evaluation.clouds.evaluate import evaluate_cloud
+from pano_mvs_evaluation.poses import evaluate_poses
+from pano_mvs_evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs_evaluation.tables import TextTable
 
 from pano_mvs.core.errors import UsageError

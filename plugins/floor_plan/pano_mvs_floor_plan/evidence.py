@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.fusion.view import normals_from_range
@@ -98,7 +98,7 @@ class CloudViews:
 
     def __init__(self, cams_from_plan: Sequence[Rigid3]) -> None:
         self._cams = cams_from_plan
-        self._tree = cKDTree([cam.center for cam in cams_from_plan])
+        self._tree = scipy.spatial.cKDTree([cam.center for cam in cams_from_plan])
         # x, y, z, their normal's and the range of the nearest point in each pixel
         self._seen = np.full((len(cams_from_plan), *_CLOUD_SIZE, 7), np.inf, np.float32)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Protocol
-from xml.sax.saxutils import escape, quoteattr
 
 import cv2
 import numpy as np
@@ -79,14 +79,14 @@ def svg_text(plan: PlanDrawing) -> str:
         for room in (plan.rooms if plan.is_metric else ())
     ]
     dots = [
-        f'<circle cx="{x:.5f}" cy="{y:.5f}" r="{size / 4:.4g}"><title>{escape(name)}</title></circle>'
+        f'<circle cx="{x:.5f}" cy="{y:.5f}" r="{size / 4:.4g}"><title>{escape(name, quote=False)}</title></circle>'
         for name, (x, y) in plan.cameras.items()
     ]
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{numbers}" width="1000" '
-            f'height="{1000 * (height + strip) / width:.0f}" data-unit={quoteattr(plan.unit)}>',
-            f"<title>{escape(plan.title)}</title>",
+            f'height="{1000 * (height + strip) / width:.0f}" data-unit="{escape(plan.unit)}">',
+            f"<title>{escape(plan.title, quote=False)}</title>",
             '<g transform="scale(1,-1)" fill="none" stroke="#182038" stroke-linecap="round">',
             '<g id="solids" fill="#182038" stroke="none">',
             *solids,

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs_floor_plan.evidence import TOP, Evidence, WallCells
@@ -147,10 +146,10 @@ def _labels(
     start = np.concatenate([edges.front, edges.back, np.full(count, source), every])
     end = np.concatenate([edges.back, edges.front, every, np.full(count, sink)])
     capacity = np.rint(np.concatenate([cost, full, np.maximum(gain, 0), np.maximum(-gain, 0)])).astype(np.int64)
-    graph = coo_array((capacity, (start, end)), shape=(count + 2, count + 2)).tocsr().astype(np.int32)
-    left = graph - maximum_flow(graph, source, sink).flow
+    graph = scipy.sparse.coo_array((capacity, (start, end)), shape=(count + 2, count + 2)).tocsr().astype(np.int32)
+    left = graph - scipy.sparse.csgraph.maximum_flow(graph, source, sink).flow
     left.eliminate_zeros()
-    reached = breadth_first_order(left, source, return_predecessors=False)
+    reached = scipy.sparse.csgraph.breadth_first_order(left, source, return_predecessors=False)
     inside = np.zeros(count + 2, np.bool_)
     inside[reached] = True
     return inside[:count]
@@ -190,8 +189,8 @@ def _components(edges: Edges, inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the number of the room of each cell, −1 outside."""
     both = inside[edges.front] & inside[edges.back]
     count = len(inside)
-    graph = coo_array((np.ones(both.sum()), (edges.front[both], edges.back[both])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(both.sum()), (edges.front[both], edges.back[both])), shape=(count, count))
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     numbers = np.full(count, -1, np.int64)
     _, numbers[inside] = np.unique(label[inside], return_inverse=True)
     return numbers

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs_floor_plan.evidence import WallCells
@@ -104,7 +104,7 @@ def _strongest(cells: WallCells) -> tuple[Line, float]:
     size = int(offset.max() - low) + 4
     index = angle * size + np.floor(offset - low).astype(np.int64)
     support = np.bincount(index, weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
-    smooth = gaussian_filter(support, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
+    smooth = scipy.ndimage.gaussian_filter(support, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
     best = int(np.argmax(smooth))
     normal = centers[best // size]
     line = Line(normal, float(middle @ normal + (best % size + low + 0.5) * cells.cell))

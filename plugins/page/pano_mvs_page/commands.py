@@ -41,7 +41,7 @@ def share(
     cache: CacheOption = None,
 ) -> None:
     """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
-    from pano_mvs_page import ShareOptions
+    from pano_mvs_page.scene_parts import ShareOptions
     from pano_mvs_page.sharing import share_output
 
     options = ShareOptions(title, points, triangles, width, quality, rooms)

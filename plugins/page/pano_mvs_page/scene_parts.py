@@ -9,8 +9,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.points.octree import octree
 from pano_mvs.core.errors import UsageError
@@ -74,7 +74,7 @@ class ShownCloud:
         """Return what is known of the nearest point of each vertex; nothing if the cloud is empty."""
         if not len(self.cloud) or not len(vertices):
             return VertexFacts(np.zeros(len(vertices), np.uint8), np.zeros(len(vertices), np.uint8))
-        nearest = cKDTree(self.cloud.points_in_world).query(vertices)[1]
+        nearest = scipy.spatial.cKDTree(self.cloud.points_in_world).query(vertices)[1]
         return VertexFacts(self.sigmas.steps[nearest].astype(np.uint8), self.cloud.view_counts[nearest])
 
 

@@ -10,9 +10,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import squareform
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, WorkflowError
@@ -344,7 +343,9 @@ def rooms_by_sight(sights: Sequence[Sight]) -> list[int]:
     shared = np.array([[_share(first, second) for second in sights] for first in sights])
     apart = 1 - np.minimum(shared, shared.T)
     np.fill_diagonal(apart, 0)
-    labels = fcluster(linkage(squareform(apart), "average"), 0.5, "distance").tolist()
+    labels = scipy.cluster.hierarchy.fcluster(
+        scipy.cluster.hierarchy.linkage(scipy.spatial.distance.squareform(apart), "average"), 0.5, "distance"
+    ).tolist()
     order = {label: number for number, label in enumerate(dict.fromkeys(labels), 1)}
     return [order[label] for label in labels]
 

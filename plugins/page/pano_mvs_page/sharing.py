@@ -22,8 +22,9 @@ from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.captures import is_early
 from pano_mvs.session.session import default_out, open_session
-from pano_mvs_page import ShareOptions, share_run
 from pano_mvs_page.page_folder import require_free
+from pano_mvs_page.scene_parts import ShareOptions
+from pano_mvs_page.share import share_run
 
 
 def share_output(

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import plural
@@ -152,7 +152,7 @@ def _by_move(moves: Sequence[tuple[int, Similarity3] | None]) -> Iterator[tuple[
 
 def _nearest_cameras(points: NDArray[np.float32], group: Poses) -> NDArray[np.intp]:
     """Return the position of the camera nearest to each point (P, 3): what it saw moves with it."""
-    return np.asarray(cKDTree(group.centers).query(points)[1], np.intp)
+    return np.asarray(scipy.spatial.cKDTree(group.centers).query(points)[1], np.intp)
 
 
 def _some_faces(mesh: SharedMesh, chosen: NDArray[np.bool_]) -> SharedMesh:

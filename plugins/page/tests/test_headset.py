@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_page import ShareOptions, share_run
+from pano_mvs_page.scene_parts import ShareOptions
+from pano_mvs_page.share import share_run
 
 from tests.browsers.browser import Browser, open_browser
 from tests.foreign import npm_packages

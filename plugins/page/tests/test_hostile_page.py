@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_page import ShareOptions, share_run
+from pano_mvs_page.scene_parts import ShareOptions
+from pano_mvs_page.share import share_run
 from pano_mvs_viewer.shown_scene import open_scene
 
 from pano_mvs.core.errors import InputError

@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pano_mvs_page import ShareOptions, share_run
 from pano_mvs_page.encoding import encode_jpeg
 from pano_mvs_page.page_folder import PageFolder
-from pano_mvs_page.scene_parts import RANGES_HW
+from pano_mvs_page.scene_parts import RANGES_HW, ShareOptions
+from pano_mvs_page.share import share_run
 
 from pano_mvs.scene.image_file import decode_image, write_png
 from tests.browsers.browser import Browser, open_browser

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pano_mvs_page import share_run
 from pano_mvs_page.maps import MapPlace, closed, coverage_colors, cut_height, place_around, run_plans, top_view
+from pano_mvs_page.share import share_run
 from test_share import value_of
 
 from pano_mvs.results.run_output import load

@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pano_mvs_page import share_run
 from pano_mvs_page.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
 from pano_mvs_page.mesh_file import SharedMesh, coarser, run_mesh, thinned
 from pano_mvs_page.scene_parts import outline
+from pano_mvs_page.share import share_run
 from test_share import value_of
 
 from pano_mvs.core.errors import InputError

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pano_mvs_page import share_run
 from pano_mvs_page.mesh_file import SharedMesh, joined_meshes, run_mesh
-from pano_mvs_page.share import page_from_world
+from pano_mvs_page.share import page_from_world, share_run
 from pano_mvs_page.shown import shown_of
 from test_share import value_of
 

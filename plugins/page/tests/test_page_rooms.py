@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_page import ShareOptions, share_run
-from pano_mvs_page.share import Sight, given_rooms, rooms_by_sight, rooms_of
+from pano_mvs_page.scene_parts import ShareOptions
+from pano_mvs_page.share import Sight, given_rooms, rooms_by_sight, rooms_of, share_run
 from test_share import value_of
 from typer.testing import CliRunner
 

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pano_mvs_page import ShareOptions, share_run
 from pano_mvs_page.encoding import encode_ranges, panorama_tiles, tile_layout
 from pano_mvs_page.page_folder import SCRIPTS
-from pano_mvs_page.share import page_from_world
+from pano_mvs_page.scene_parts import ShareOptions
+from pano_mvs_page.share import page_from_world, share_run
 from typer.testing import CliRunner
 
 import pano_mvs

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pano_mvs.api import CHUNK_POINTS, KeptPoints, Panorama, PointCloud, Rigid3, chunks
 from pye57 import libe57
-from scipy.spatial.transform import Rotation
 
 from pano_mvs_las.e57_panoramas import CAM_FROM_IMAGE
 from pano_mvs_las.las_file import bounds
@@ -167,7 +167,7 @@ def _write_panorama(file: libe57.ImageFile, placed: PlacedPanorama, placement: P
         image.set(name, libe57.StringNode(file, text))
     center = placed.cam_from_world.center
     file_from_image = placement.rotation_at(center) @ placed.cam_from_world.rotation.T @ CAM_FROM_IMAGE
-    x, y, z, w = Rotation.from_matrix(file_from_image).as_quat().tolist()
+    x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(file_from_image).as_quat().tolist()
     sign = -1.0 if w < 0 else 1.0  # the standard wants w ≥ 0
     pose = libe57.StructureNode(file)
     pose.set("rotation", _structure(file, {"w": sign * w, "x": sign * x, "y": sign * y, "z": sign * z}))

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from pano_mvs.api import InputError, Rigid3
 from pye57 import libe57
-from scipy.spatial.transform import Rotation
 
 # E57's camera has x forward, y left and z up (8.4.14.4 of the standard); ours x right, y down and z forward.
 CAM_FROM_IMAGE = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -119,7 +119,7 @@ def _pose(image: Any, where: str) -> Rigid3 | None:
         place = np.array([_number(pose["translation"], key, where) for key in "xyz"])
     if not np.isfinite([*quaternion, *place]).all() or np.linalg.norm(quaternion) < 1e-6:
         raise InputError(f"{where}: its pose has no finite numbers, or a quaternion of length 0. Export it again")
-    rotation = CAM_FROM_IMAGE @ Rotation.from_quat(quaternion).as_matrix().T
+    rotation = CAM_FROM_IMAGE @ scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix().T
     return Rigid3(rotation, -rotation @ place)
 
 

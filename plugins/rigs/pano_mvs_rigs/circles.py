@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pano_mvs.core.arrays import FloatArray, Picture
 
@@ -72,7 +72,7 @@ def find_circle(brightness: NDArray[np.uint8]) -> ImageCircle | None:
     edge = last[columns] + np.clip((before - level) / np.maximum(before - after, 1e-9), 0, 1)
     points = middle + edge[:, None] * across[columns]
     start = np.array([*middle, np.median(edge)])
-    fit = least_squares(_distances, start, args=(points,), loss="cauchy", f_scale=0.5)
+    fit = scipy.optimize.least_squares(_distances, start, args=(points,), loss="cauchy", f_scale=0.5)
     residual = float(np.median(np.abs(_distances(fit.x, points))))
     if residual > 0.01 * fit.x[2]:
         return None

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, Pose, Poses, RangeMap, WorldAxes, stage
@@ -153,7 +153,7 @@ def _texts(scenes: list[Scene], players: tuple[Player, ...], group: int) -> dict
 
 def _links(centers: NDArray[np.float64], level_from_world: NDArray[np.float64]) -> list[tuple[Link, ...]]:
     """Return the links of each panorama to its neighbours in the Gabriel graph, the nearest first."""
-    tree, links = cKDTree(centers), []
+    tree, links = scipy.spatial.cKDTree(centers), []
     for idx, center in enumerate(centers):
         steps = centers - center
         lengths = np.linalg.norm(steps, axis=1)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, wall_azimuth
 from pano_mvs.algorithms.poses.joining.floors import height_over_points
@@ -94,18 +93,18 @@ def house_of_links(
 
 def _certain(group: Poses) -> list[list[str]]:
     """Return the cameras of a group that are not doubtful and share points, in parts of two or more, largest first."""
-    seen = coo_array(
+    seen = scipy.sparse.coo_array(
         (np.ones(len(group.track_image_idx)), (group.track_image_idx, group.track_point_idx)),
         (len(group.names), len(group.points_in_world)),
     ).tocsr()
     certain = np.array([name not in group.doubts for name in group.names], np.bool_)
-    shared = coo_array(seen @ seen.T)
+    shared = scipy.sparse.coo_array(seen @ seen.T)
     joins = (shared.data >= _SHARED_POINTS) & certain[shared.row] & certain[shared.col]
     ends = np.stack([shared.row[joins], shared.col[joins]]).astype(np.intp)
     if not len(group.points_in_world):  # poses from a file: nothing speaks against their connection
         ends = np.stack([np.flatnonzero(certain)[:-1], np.flatnonzero(certain)[1:]])
-    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(certain), len(certain)))
-    labels = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(certain), len(certain)))
+    labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     parts = [np.flatnonzero(certain & (labels == label)) for label in np.unique(labels[certain])]
     parts.sort(key=lambda part: (-len(part), int(part[0])))
     return [[group.names[idx] for idx in part] for part in parts if len(part) > 1]

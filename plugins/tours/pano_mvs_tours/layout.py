@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs_tours.parts import Part, PartLink
@@ -57,7 +57,9 @@ def layout(parts: Sequence[Part], links: Sequence[PartLink], *, rng: np.random.G
 
     starts = min(_STARTS, max(_LEAST_STARTS, 12 * _STARTS // len(joined))) if len(joined) > 1 else 1
     solutions = [
-        least_squares(residuals, _start(parts, joined, used, rng=rng).ravel(), loss="cauchy", xtol=1e-10, ftol=1e-10)
+        scipy.optimize.least_squares(
+            residuals, _start(parts, joined, used, rng=rng).ravel(), loss="cauchy", xtol=1e-10, ftol=1e-10
+        )
         for _ in range(starts)
     ]
     # Of solutions whose costs differ by no more than rounding, the first one.

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from urllib.parse import quote
-from xml.sax.saxutils import quoteattr
 
 PANNELLUM, MARZIPANO = "2.5.7", "0.10.2"
 _HEAD = (
@@ -144,6 +143,8 @@ def marzipano_page(data: str) -> str:
 
 def krpano_tour(scenes: Sequence[Scene]) -> str:
     """Return the XML of a tour for krpano."""
+    from xml.sax.saxutils import quoteattr  # which loads ssl, 40 ms
+
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<krpano onstart="loadscene(scene_0, null, MERGE);">']
     for number, scene in enumerate(scenes):
         heading = "" if scene.heading_deg is None else f' heading="{scene.heading_deg:.4f}"'

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, camera_span, held
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
@@ -288,7 +288,7 @@ def _step(
     band, gradient = held(system.band, system.gradient, fixed_camera)
     try:
         steps = -camera_solver(band)(gradient).reshape(-1, 6)
-    except LinAlgError:
+    except scipy.linalg.LinAlgError:
         return bundle
     return replace(
         bundle,

@@ -9,10 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from pano_mvs.core.arrays import FloatArray, IndexArray
 
@@ -27,11 +25,11 @@ def camera_order(point_idx: IndexArray, image_idx: IndexArray, count: int) -> ND
         image_idx: (T,) its camera.
         count: number of cameras.
     """
-    seen = csr_array(
+    seen = scipy.sparse.csr_array(
         (np.ones(len(point_idx), np.float32), (point_idx, image_idx)), shape=(int(point_idx[-1]) + 1, count)
     )
-    shared = csr_array(seen.T @ seen)
-    return np.asarray(reverse_cuthill_mckee(shared, symmetric_mode=True), np.intp)
+    shared = scipy.sparse.csr_array(seen.T @ seen)
+    return np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(shared, symmetric_mode=True), np.intp)
 
 
 def camera_span(starts: NDArray[np.intp], image_idx: IndexArray) -> int:
@@ -67,10 +65,10 @@ def camera_solver(band: FloatArray) -> Callable[[FloatArray], FloatArray]:
     size, width = band.shape
     # A band wider than this share of the matrix is solved faster as a full matrix.
     if width > 0.4 * size:
-        whole = cho_factor(dense_from_band(band), lower=True, overwrite_a=True)
-        return lambda right: np.asarray(cho_solve(whole, right), np.float64)
-    factor = cholesky_banded(band.T, lower=True)
-    return lambda right: np.asarray(cho_solve_banded((factor, True), right), np.float64)
+        whole = scipy.linalg.cho_factor(dense_from_band(band), lower=True, overwrite_a=True)
+        return lambda right: np.asarray(scipy.linalg.cho_solve(whole, right), np.float64)
+    factor = scipy.linalg.cholesky_banded(band.T, lower=True)
+    return lambda right: np.asarray(scipy.linalg.cho_solve_banded((factor, True), right), np.float64)
 
 
 def dense_from_band(band: FloatArray) -> FloatArray:

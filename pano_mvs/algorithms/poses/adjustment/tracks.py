@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.core.settings import Setting, checks_settings
@@ -161,8 +160,8 @@ def _match_nodes(
 
 
 def _labels(nodes: NDArray[np.int64], total: int) -> NDArray[np.intp]:
-    graph = coo_array((np.ones(len(nodes), np.int8), (nodes[:, 0], nodes[:, 1])), shape=(total, total))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    graph = scipy.sparse.coo_array((np.ones(len(nodes), np.int8), (nodes[:, 0], nodes[:, 1])), shape=(total, total))
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], np.intp)
 
 
 def _without_conflicts(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.bundle import (
     Bundle,
@@ -76,7 +76,7 @@ def camera_deviations(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> tu
     variance = held_system.variance
     try:
         diagonal = variance * _inverse_diagonal(band)
-    except LinAlgError:
+    except scipy.linalg.LinAlgError:
         diagonal = np.full(len(band), np.nan)
     deviations = np.sqrt(diagonal.reshape(-1, 2, 3).sum(axis=2))
     deviations[unseen] = np.nan
@@ -162,7 +162,7 @@ def parameter_step(
         own = np.stack([unexplained(held, derivatives, by) for by in np.moveaxis(by_parameters, 2, 0)], axis=-1)
         information = np.einsum("t,tik,til->kl", held.weights, own, own)
         covariance = held.variance * np.linalg.inv(information)
-    except LinAlgError:
+    except scipy.linalg.LinAlgError:
         return np.zeros(count), np.full((count, count), np.inf)
     step = -np.linalg.solve(information, np.einsum("t,tik,ti->k", held.weights, own, derivatives.residuals))
     known = np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.upside_down import most_probable_up, upside_down_probability
@@ -306,7 +306,7 @@ def _concentration(heights: FloatArray, width: float) -> float:
     fractions = positions - lower
     size = int(lower.max()) + 2
     counts = np.bincount(lower, 1 - fractions, size) + np.bincount(lower + 1, fractions, size)
-    smooth = gaussian_filter1d(counts, 2.0, mode="constant")
+    smooth = scipy.ndimage.gaussian_filter1d(counts, 2.0, mode="constant")
     return float(np.sum(smooth**2)) / (step * len(heights) ** 2)
 
 

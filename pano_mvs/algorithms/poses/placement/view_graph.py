@@ -6,9 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.geometry import Rigid3, geodesic_angle
 from pano_mvs.scene import TwoView
@@ -54,8 +53,8 @@ def consistent_edges(names: tuple[str, ...], two_views: Mapping[tuple[str, str],
 def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
     """Return the connected groups of images, largest first; of equals, the group with the earliest image first."""
     ends = np.array(list(edges), np.intp).reshape(-1, 2)
-    graph = coo_array((np.ones(len(ends)), ends.T), (count, count))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(len(ends)), ends.T), (count, count))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     groups = [np.flatnonzero(label == number).tolist() for number in range(label.max(initial=-1) + 1)]
     return sorted(groups, key=lambda group: (-len(group), group[0]))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Similarity3
@@ -106,13 +106,13 @@ def _parts(cloud: PointSource) -> Iterator[tuple[slice, NDArray[np.float32]]]:
             start += len(part)
 
 
-def _tree(points: NDArray[np.float32]) -> cKDTree | None:
+def _tree(points: NDArray[np.float32]) -> scipy.spatial.cKDTree | None:
     """Return a search tree of points; None without points."""
     # Split in the middle of the box, not at the median: as fast for points on surfaces, and built in half the time.
-    return cKDTree(points, balanced_tree=False, compact_nodes=False) if len(points) else None
+    return scipy.spatial.cKDTree(points, balanced_tree=False, compact_nodes=False) if len(points) else None
 
 
-def _nearest(points: NDArray[np.float32], others: cKDTree | None, limit: float) -> NDArray[np.float32]:
+def _nearest(points: NDArray[np.float32], others: scipy.spatial.cKDTree | None, limit: float) -> NDArray[np.float32]:
     """Return the distance, (N,), from each point to the nearest other; infinite beyond the limit or without others."""
     if others is None or not len(points):
         return np.full(len(points), np.inf, np.float32)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
@@ -156,7 +155,9 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
     number = {image: idx for idx, image in enumerate(images)}
     ends = np.array([[number[image] for image in edge] for edge in weights]).T
     values = np.array([*weights.values()])
-    graph = csr_array(coo_array((np.tile(values, 2), np.concatenate([ends, ends[::-1]], axis=1)), (len(images),) * 2))
+    graph = scipy.sparse.csr_array(
+        scipy.sparse.coo_array((np.tile(values, 2), np.concatenate([ends, ends[::-1]], axis=1)), (len(images),) * 2)
+    )
     found = np.full(len(images), np.inf)
     for part in _branches(graph):
         cut = float((graph @ (1.0 - part))[part].sum())
@@ -167,17 +168,17 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
     return dict(zip(images, found.tolist(), strict=True)), float(against / (np.abs(values).sum() + 1.0))
 
 
-def _branches(graph: csr_array) -> Iterator[NDArray[np.bool_]]:
+def _branches(graph: scipy.sparse.csr_array) -> Iterator[NDArray[np.bool_]]:
     """Yield parts of a graph that may have a weak cut: each node, and what hangs on an edge of the strongest tree."""
     count = graph.shape[0]
     yield from np.eye(count, dtype=np.bool_)
     strong = graph.maximum(0)
     strong.eliminate_zeros()
     strong.data *= -1
-    tree = minimum_spanning_tree(strong)
-    parts = connected_components(tree, directed=False)[1]
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(strong)
+    parts = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
     for part in range(parts.max() + 1):
-        order, before = breadth_first_order(tree, int(np.argmax(parts == part)), directed=False)
+        order, before = scipy.sparse.csgraph.breadth_first_order(tree, int(np.argmax(parts == part)), directed=False)
         inside = np.eye(count, dtype=np.bool_)[order]  # of each node, the branch that hangs on it
         place = {node: idx for idx, node in enumerate(order.tolist())}
         for idx in range(len(order) - 1, 0, -1):
