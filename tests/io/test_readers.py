@@ -86,6 +86,26 @@ def test_poses_from_model_uses_the_plugin_whatever_the_suffix(log: Path, suffix:
     assert match_images(["000.png"], ["000.png"], log.with_suffix(f".{suffix}")) == ({"000.png": "000.png"}, "")
 
 
+def test_the_code_of_a_reader_is_in_the_cache_key(log: Path, mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses that an earlier version of a reader had read stayed in the cache."""
+    images = tiny_capture(Variant((32, 64))).folder / "images"
+    Path("known.yaml").write_text(WORKFLOW.format(images=images, suffix="log"))
+
+    def computed() -> list[int]:
+        return [stage.run for stage in pano_mvs.run("known.yaml", executor="serial").summary.stages]
+
+    assert computed() == [4, 1]
+    assert computed() == [0, 0]
+    (mine / "walk.py").write_text("# a comment\n" + LOG)
+    assert computed() == [0, 0]
+    (mine / "walk.py").write_text(LOG.replace("np.eye(3), [float(x)", "np.eye(3), [2 * float(x)"))
+    assert computed() == [0, 1]
+    monkeypatch.setattr(POSE_READERS, "_added", {})
+    (mine / "walk.py").unlink()
+    run = pano_mvs.run("known.yaml", executor="serial")
+    assert "poses are read from a COLMAP model" in run.summary.failures[0].cause
+
+
 def test_errors_of_a_reader_name_the_file(log: Path) -> None:
     log.write_text("WALK 1\n000.png 1\n")
     with pytest.raises(InputError, match=r"walk\.log:2: must be a name and three numbers"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import unwrap
 from pathlib import Path
 
 import numpy as np
@@ -188,6 +189,17 @@ def match_images(images: Sequence[str], names: Sequence[str], path: Path) -> tup
         return match_image_names(images, names), ""
     matched, how = match_times(images, names, path)
     return matched, f"the poses in {path.name} belong to the images by {how}"
+
+
+def file_of_reader(path: Path) -> Path | None:
+    """Return the Python file of the plugin that reads a file of poses or positions; None if no plugin reads it."""
+    try:
+        path = _file_or_model(path)
+    except InputError:
+        return None
+    reader = None if is_folder(path) else pose_reader_of(path)
+    code = None if reader is None else getattr(unwrap(reader.read), "__code__", None)
+    return None if code is None else Path(code.co_filename)
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:
