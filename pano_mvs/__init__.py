@@ -58,22 +58,18 @@ _HOMES = {
 }
 
 
-# The group of the entry points by which plugins add names to this module.
-FUNCTIONS_GROUP = "pano_mvs.functions"
-
-
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
     if not name.startswith("_"):
-        from pano_mvs.core.doors import installed, load_entry
+        from pano_mvs.core.doors import FUNCTIONS  # which plugins offer
 
-        for entry in installed(FUNCTIONS_GROUP).get(name, ())[:1]:
-            return load_entry(entry)
+        if name in FUNCTIONS.names():
+            return FUNCTIONS.get(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    from pano_mvs.core.doors import installed
+    from pano_mvs.core.doors import FUNCTIONS
 
-    return sorted({*globals(), *_HOMES, *installed(FUNCTIONS_GROUP)})
+    return sorted({*globals(), *_HOMES, *FUNCTIONS.names()})

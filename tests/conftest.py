@@ -6,6 +6,7 @@ import gc
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,6 +20,8 @@ import cv2  # noqa: F401
 import pytest
 import typer.main
 from hypothesis import HealthCheck, settings
+
+from tests.plugin_packages import Packages, empty_doors, packages_in
 
 # How long it takes to draw an example depends on what else the machine does.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -44,3 +47,20 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
+    """Installed packages with plugins; none at first."""
+    with packages_in(tmp_path / "site", monkeypatch) as found:
+        yield found
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The user's plugin folder; empty at first."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    monkeypatch.setenv("PANO_MVS_PLUGINS", str(folder))
+    with empty_doors(monkeypatch):
+        yield folder

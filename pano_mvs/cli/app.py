@@ -198,7 +198,7 @@ def run(given: RunArguments, options: Mapping[str, tuple[str, ...]] | None = Non
         given.executor,
         given.workers,
         given.threads,
-        options={name: values[0] for name, values in (options or {}).items() if name not in observers},
+        options={name: ("", *values)[-1] for name, values in (options or {}).items() if name not in observers},
         min_free=given.min_free,
         durable=given.durable,
     )

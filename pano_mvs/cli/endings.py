@@ -73,12 +73,17 @@ def guarded(command: Command) -> Command:
         if get_origin(parameter.annotation) is not Annotated:
             continue
         hint, info, *_ = get_args(parameter.annotation)
-        if Path in _leaves(hint):
+        if Path in _leaves(hint) and not _is_checked(info):
             info.parser = path
         elif str in _leaves(hint) and isinstance(info, ArgumentInfo):
             info.parser = text
     run_guarded.__signature__ = signature  # type: ignore[attr-defined]
     return cast(Command, run_guarded)
+
+
+def _is_checked(info: Any) -> bool:
+    """Return whether a parameter of a plugin's command has checks of its own, which a parser would replace."""
+    return any(getattr(info, name, None) for name in ("click_type", "exists", "resolve_path"))
 
 
 def _leaves(hint: Any) -> list[Any]:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.core.text import error_text
+from pano_mvs.core.text import error_summary
 
 Value = TypeVar("Value")
 DISTRIBUTION = "pano-mvs"
@@ -57,6 +57,20 @@ class Door(NamedRegistry[Value]):
         self._accepts = accepts
         self._loaded: dict[str, Value] = {}
 
+    def register(self, name: str, value: Value, function: Callable[..., Any]) -> None:
+        """Add a plugin's value; see `NamedRegistry.register`.
+
+        Raises:
+            PluginError: if the name has other characters, is that of a built-in value, or an installed package offers
+                another value with it.
+        """
+        for entry in installed(self.group).get(name, ()):
+            if entry.module != function.__module__:  # a package may register what its entry point names
+                raise PluginError(
+                    f"the {self.kind} {name!r} is that of {origin_of(entry)}: register yours under another name"
+                )
+        super().register(name, value, function)
+
     def names(self) -> tuple[str, ...]:
         """Return all names: the built-in ones, those of files, and those of packages, which need not load."""
         others = [*self._added, *(name for name in installed(self.group) if name not in self._builtin)]
@@ -66,9 +80,11 @@ class Door(NamedRegistry[Value]):
         """Return a value; a module that is not loaded yet is imported.
 
         Raises:
-            UsageError: if there is none with this name.
-            PluginError: if it cannot be loaded, or two packages offer it.
+            UsageError: if no value has this name.
+            PluginError: if it cannot be loaded, or two plugins offer it.
         """
+        if name not in self._builtin and (why := self.why_withheld(name)):
+            raise PluginError(f"the {self.kind} {name!r} cannot be used: {why}")
         if name in self._builtin or name in self._added or name not in installed(self.group):
             return super().get(name)
         if name not in self._loaded:
@@ -76,9 +92,9 @@ class Door(NamedRegistry[Value]):
         return self._loaded[name]
 
     def origin(self, name: str) -> str:
-        """Return where a name comes from: a distribution with its version, or a file."""
-        if (function := self.code_file(name)) is not None:
-            return str(function)
+        """Return where a name comes from: a file, or what `origin_of` returns for its entry points."""
+        if (file := self.code_file(name)) is not None:
+            return str(file)
         if name in self._builtin:
             return "built in"
         return " and ".join(origin_of(entry) for entry in installed(self.group).get(name, ()))
@@ -108,15 +124,14 @@ class Door(NamedRegistry[Value]):
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # also others than Exception, as a plugin's code may raise
-            summary = " ".join(f"{type(error).__name__}: {error_text(error)}".split())
             raise PluginError(
                 f"the {self.kind} {name!r} of {origin_of(entry)} cannot be used, because {entry.value} failed to load: "
-                f"{summary}. Update or uninstall that plugin"
+                f"{error_summary(error)}. {_remedy(entry)}"
             ) from error
         if value is None:
             raise PluginError(
                 f"the {self.kind} {name!r} of {origin_of(entry)} cannot be used: {entry.value} is not "
-                f"{'an' if self.kind[0] in 'aeio' else 'a'} {self.kind}. Update or uninstall that plugin"
+                f"{'an' if self.kind[0] in 'aeio' else 'a'} {self.kind}. {_remedy(entry)}"
             )
         return value
 
@@ -144,7 +159,10 @@ def installed(group: str) -> Mapping[str, Sequence[EntryPoint]]:
 
 
 def origin_of(entry: EntryPoint) -> str:
-    """Return the distribution of an entry point, with its version."""
+    """Return the distribution of an entry point with its version; of a bundled plugin, the name of its package."""
+    package = entry.module.partition(".")[0]
+    if is_bundled(entry) and package != "pano_mvs":
+        return package
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
 
 
@@ -161,3 +179,15 @@ def own_packages() -> frozenset[str]:
 def is_bundled(entry: EntryPoint) -> bool:
     """Return whether an entry point is one of our own distribution."""
     return entry.dist is not None and entry.dist.name == DISTRIBUTION
+
+
+def _remedy(entry: EntryPoint) -> str:
+    return f"Install {DISTRIBUTION} again" if is_bundled(entry) else "Update or uninstall that plugin"
+
+
+FUNCTIONS = Door[Callable[..., Any]](
+    "function",
+    "pano_mvs.functions",
+    accepts=lambda value: value if callable(value) else None,
+)
+"""Functions that plugins add to the names of `pano_mvs` itself."""

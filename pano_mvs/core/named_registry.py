@@ -70,10 +70,10 @@ class NamedRegistry(Generic[Value]):
 
     def check(self, name: str) -> str:
         """Return the name if it is registered, else raise UsageError."""
-        why = _unavailable.get((self.kind, name))
-        if name in self._builtin or (name in self._added and why is None):
+        why = self.why_withheld(name)
+        if name in self._builtin or (name in self._added and not why):
             return name
-        if why is not None:
+        if why:
             raise UsageError(f"the {self.kind} {name!r} cannot be used: {why}")
         close = get_close_matches(name, self.names(), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
@@ -82,6 +82,10 @@ class NamedRegistry(Generic[Value]):
             "the plugin or list its file under `plugins:`"
         )
         raise UsageError("\n".join([text, *_broken]))
+
+    def why_withheld(self, name: str) -> str:
+        """Return why a name that plugins define cannot be used, such as two definitions; "" if it can."""
+        return _unavailable.get((self.kind, name), "")
 
     def code_file(self, name: str) -> Path | None:
         """Return the plugin file behind a name, or None if the value is built in."""

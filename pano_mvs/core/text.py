@@ -32,6 +32,11 @@ def error_text(error: BaseException) -> str:
         return f"(its message cannot be shown: {type(second).__name__})"
 
 
+def error_summary(error: BaseException) -> str:
+    """Return the class and the message of an error in one line."""
+    return " ".join(f"{type(error).__name__}: {error_text(error)}".split())
+
+
 def plural(count: int, one: str, many: str = "") -> str:
     """Return the singular or plural of a word or phrase for a count; `many` defaults to `one` with an s.
 

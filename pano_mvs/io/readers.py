@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from pano_mvs.core.doors import Door
-from pano_mvs.core.errors import PluginError
+from pano_mvs.core.errors import InputError, PanoMvsError, PluginError
+from pano_mvs.core.text import error_summary
 from pano_mvs.geometry import Rigid3
 
 
@@ -21,7 +23,8 @@ class CaptureReader:
 
     what: str  # the kind, in words: "a video"
     source: str  # name of the stage, such as `source.video`
-    recognises: Callable[[Path], bool]  # whether a file or folder is of this kind; it exists
+    # whether a file or folder, which exists, is of this kind; InputError if it is but cannot be read
+    recognises: Callable[[Path], bool]
     # what to do where a workflow has another source; empty if the stage can take the place of `source.folder`, with the
     # settings that both have
     advice: str = ""
@@ -59,26 +62,64 @@ POSE_READERS = Door[PoseReader](
 
 
 def capture_reader_of(path: Path) -> CaptureReader | None:
-    """Return the reader of the kind of capture that a file or folder holds; None if no plugin has one."""
-    for name in CAPTURE_READERS.names():
-        try:
-            reader = CAPTURE_READERS.get(name)
-        except PluginError:
-            continue  # `pano-mvs plugins` shows why
-        if reader.recognises(path):
-            return reader
-    return None
+    """Return the reader of the kind of capture that a file or folder holds; None if no plugin reads it.
+
+    Raises:
+        PluginError: if a reader fails when it looks at the file or folder.
+    """
+    return _recogniser(CAPTURE_READERS, path)
 
 
 def pose_reader_of(path: Path) -> PoseReader | None:
-    """Return the reader of a plugin for a file of poses; None if no plugin has one."""
-    for name in POSE_READERS.names():
+    """Return the reader of a plugin for a file of poses; None if no plugin reads it.
+
+    Raises:
+        PluginError: if a reader fails when it looks at the file.
+    """
+    return _recogniser(POSE_READERS, path)
+
+
+def poses_of_plugin(path: Path) -> PosesRead | None:
+    """Return the poses in a file that a plugin reads; None if no plugin reads it.
+
+    Raises:
+        InputError: if the file is invalid, or holds no poses.
+        PluginError: if the reader fails in any other way.
+    """
+    reader = pose_reader_of(path)
+    if reader is None:
+        return None
+    try:
+        found = reader.read(path)
+    except (PanoMvsError, OSError):
+        raise
+    except Exception as error:
+        raise PluginError(f"{path}: the plugin that reads {reader.what} failed: {error_summary(error)}") from error
+    if not found.groups:
+        raise InputError(f"{path}: {reader.what}, but it holds no poses")
+    return found
+
+
+Reader = TypeVar("Reader", CaptureReader, PoseReader)
+
+
+def _recogniser(door: Door[Reader], path: Path) -> Reader | None:
+    """Return the first reader that recognises a file or folder; readers that cannot be loaded recognise nothing."""
+    for name in door.names():
         try:
-            reader = POSE_READERS.get(name)
+            reader = door.get(name)
         except PluginError:
-            continue
-        if reader.recognises(path):
-            return reader
+            continue  # `pano-mvs plugins` shows why
+        try:
+            if reader.recognises(path):
+                return reader
+        except (PanoMvsError, OSError):
+            raise
+        except Exception as error:  # another reader could read the file differently, so that this is not ignored
+            raise PluginError(
+                f"{path}: the {door.kind} {name!r} ({door.origin(name)}) failed to look at it: {error_summary(error)}. "
+                "Update or uninstall that plugin"
+            ) from error
     return None
 
 

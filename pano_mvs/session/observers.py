@@ -12,19 +12,20 @@ An observer is a function that returns a context in which it listens:
         yield take
 
 `pano-mvs run --bell` switches it on. It receives the events of `pano_mvs.session.progress` in the thread of the run, so
-that it should not take long. An error that it raises ends it with a warning, and the run goes on.
+that it should not take long. An error that it raises ends it with a warning, and the run goes on. Its context is closed
+after the last event of the run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pano_mvs.core.doors import Door, RunOption
 from pano_mvs.core.errors import PanoMvsError, PluginError
-from pano_mvs.core.text import error_text
+from pano_mvs.core.text import error_summary
 from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.session.progress import Event, Progress, RunFinished
@@ -94,6 +95,7 @@ class Observers:
     out: Path
     _listening: dict[str, Progress] = field(default_factory=dict)  # by name
     _warnings: list[str] = field(default_factory=list)  # that were not passed on yet
+    _contexts: dict[str, ExitStack] = field(default_factory=dict)  # of those that listen, by name
     _has_ended: bool = False  # whether they have received the last event of the run
 
     def beside(self, progress: Progress) -> Progress:
@@ -111,27 +113,66 @@ class Observers:
 
         return report if self._listening else progress
 
+    def start(self, name: str, values: Sequence[str]) -> None:
+        """Let an observer listen; see `observing`."""
+        context, run = ExitStack(), ObservedRun(self.out, self._warnings.append)
+        make = OBSERVERS.get(name).make
+        try:
+            take = context.enter_context(make(tuple(values), run))
+        except (PanoMvsError, KeyboardInterrupt):
+            raise
+        except BaseException as error:  # also others than Exception, as a plugin's code may raise
+            raise PluginError(
+                f"the observer {name} ({OBSERVERS.origin(name)}) cannot start: {error_summary(error)}"
+            ) from error
+        self._listening[name], self._contexts[name] = take, context
+
+    def end(self, error: BaseException | None = None) -> None:
+        """Close the observers; those of a run that an error kept from beginning learn of it first."""
+        if error is not None and not self._has_ended:
+            code = error.exit_code if isinstance(error, PanoMvsError) else 1
+            text, code = ("interrupted", INTERRUPTED) if isinstance(error, KeyboardInterrupt) else (str(error), code)
+            self._take(RunFinished(code, text, out=self.out), lambda _: None)
+        for name in list(self._listening):
+            self._close(name)
+
     def _take(self, event: Event, progress: Progress) -> None:
         self._has_ended |= isinstance(event, RunFinished) and event.out == self.out
         for name, take in list(self._listening.items()):
             try:
                 take(event)
-            except Exception as error:
-                del self._listening[name]
-                self._warnings.append(_failure(name, error))
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
+                self._warn(name, error)
+                with suppress(Exception):  # the first error is the one to report
+                    self._forget(name)
+            else:
+                if self._has_ended:
+                    self._close(name)
         while self._warnings:
             progress(Warned(self._warnings.pop(0)))
 
-    def _end(self, error: BaseException) -> None:
-        """Report the end of a run that an error kept from beginning."""
-        if not self._has_ended:
-            code = error.exit_code if isinstance(error, PanoMvsError) else 1
-            text, code = ("interrupted", INTERRUPTED) if isinstance(error, KeyboardInterrupt) else (str(error), code)
-            self._take(RunFinished(code, text, out=self.out), lambda _: None)
+    def _close(self, name: str) -> None:
+        try:
+            self._forget(name)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            self._warn(name, error)
+
+    def _forget(self, name: str) -> None:
+        del self._listening[name]
+        if name in self._contexts:
+            self._contexts.pop(name).close()
+
+    def _warn(self, name: str, error: BaseException) -> None:
+        place = f"{name} ({OBSERVERS.origin(name)})"
+        self._warnings.append(f"the observer {place} failed, and receives nothing more: {error_summary(error)}")
 
 
 @contextmanager
-def observing(wanted: Mapping[str, tuple[str, ...]], out: Path) -> Iterator[Observers]:
+def observing(wanted: Mapping[str, Sequence[str]], out: Path) -> Iterator[Observers]:
     """Let observers listen in this context; they learn of its end in any case.
 
     Args:
@@ -140,20 +181,15 @@ def observing(wanted: Mapping[str, tuple[str, ...]], out: Path) -> Iterator[Obse
 
     Raises:
         UsageError: if there is no such observer, or it does not accept its values.
-        PluginError: if one cannot be loaded.
+        PluginError: if one cannot be loaded, or fails to start.
     """
     observers = Observers(out)
-    with ExitStack() as stack:
+    try:
         for name, values in wanted.items():
-            run = ObservedRun(out, observers._warnings.append)
-            observers._listening[name] = stack.enter_context(OBSERVERS.get(name).make(values, run))
-        try:
-            yield observers
-        except BaseException as error:
-            observers._end(error)
-            raise
-
-
-def _failure(name: str, error: Exception) -> str:
-    summary = " ".join(f"{type(error).__name__}: {error_text(error)}".split())
-    return f"the observer {name} ({OBSERVERS.origin(name)}) failed, and receives nothing more: {summary}"
+            observers.start(name, values)
+        yield observers
+    except BaseException as error:
+        observers.end(error)
+        raise
+    else:
+        observers.end()

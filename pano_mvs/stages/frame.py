@@ -15,10 +15,11 @@ from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, sca
 from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations as without_scale_factors
 from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
-from pano_mvs.api import All, Context, InputError, InputPath, One, Panorama, Params, Poses, arguments_from, stage
+from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import matched_positions
 from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.stages.pose_paths import PosesPath
 
 
 def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
@@ -108,7 +109,7 @@ class ScaleParams(Params):
         default=None, gt=0, description="median height of the cameras above the floor, in metres"
     )
     gps: bool = Field(default=False, description="scale by the GPS positions in the images' metadata")
-    positions: InputPath | None = Field(
+    positions: PosesPath | None = Field(
         default=None, description="scale by surveyed positions in metres: a table with name, x, y, z"
     )
     factor: float | None = Field(default=None, gt=0, description="metres per unit of the poses")

@@ -26,7 +26,6 @@ from pano_mvs.api import (
     Features,
     GlobalDescriptor,
     InputError,
-    InputPath,
     Names,
     One,
     Pairs,
@@ -40,6 +39,7 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.io.poses.files import matched_positions
+from pano_mvs.stages.pose_paths import PosesPath
 
 
 def _memory_of_auto(params: Params, count: int) -> int:
@@ -147,7 +147,7 @@ def learned(features: All[Features], matches: All[TwoView] | None, params: Param
 class PositionParams(Params):
     """Settings of pairs.position."""
 
-    path: InputPath | None = Field(
+    path: PosesPath | None = Field(
         default=None,
         description="positions in a table with name, x, y, z, or in any input of poses.from_model, instead of GPS",
     )

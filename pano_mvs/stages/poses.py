@@ -21,7 +21,6 @@ from pano_mvs.api import (
     Context,
     Features,
     InputError,
-    InputPath,
     One,
     Panorama,
     Params,
@@ -35,6 +34,7 @@ from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.io.images.names import match_image_names, without_shared
 from pano_mvs.io.poses.files import match_images, read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import CLOSER, join_groups, require_two_cameras, split_groups
+from pano_mvs.stages.pose_paths import PosesPath
 
 
 @params_from(solve_scaled_translation, own_last=True)
@@ -196,7 +196,7 @@ def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, c
 class FromModelParams(Params):
     """Settings of poses.from_model."""
 
-    path: InputPath = Field(
+    path: PosesPath = Field(
         description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json, "
         "sfm_data.json, cameras.sfm, XML of Metashape, CSV, or a trajectory (.txt, .tum)"
     )

@@ -13,7 +13,6 @@ from pano_mvs.api import (
     All,
     Context,
     Features,
-    InputPath,
     Panorama,
     Params,
     Poses,
@@ -22,6 +21,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
+from pano_mvs.stages.pose_paths import PosesPath
 from pano_mvs.stages.poses import checked_poses, known_poses, reported_poses
 
 
@@ -29,7 +29,7 @@ from pano_mvs.stages.poses import checked_poses, known_poses, reported_poses
 class ColmapParams(Params):
     """Settings of poses.colmap."""
 
-    fixed: InputPath | None = Field(
+    fixed: PosesPath | None = Field(
         default=None, description="known poses to keep fixed (any input of poses.from_model); incremental mapper only"
     )
 
@@ -63,7 +63,7 @@ def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Cont
 class ExtendParams(Params):
     """Settings of poses.extend."""
 
-    path: InputPath = Field(description="known poses: any input of poses.from_model")
+    path: PosesPath = Field(description="known poses: any input of poses.from_model")
 
 
 @stage("poses.extend")

@@ -7,6 +7,9 @@
 Each test calls the stage on a tiny synthetic capture (`pano_mvs.testing.tiny_capture`), with inputs as earlier stages
 might produce them. Where a test is about tiny images or empty inputs, the stage may reject its inputs with one of our
 errors, such as InputError. Any other exception breaks the contract.
+
+What plugins bring beside stages has contracts of its own, in the modules `command_contract`, `executor_contract`,
+`observer_contract` and `reader_contract`, whose functions can be imported from here too.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import multiprocessing
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -36,24 +39,27 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
+from pano_mvs.testing.command_contract import command_contract_tests
+from pano_mvs.testing.contract import ContractTest, registered_names
+from pano_mvs.testing.executor_contract import executor_contract_tests
 from pano_mvs.testing.exporters import exporter_tests
+from pano_mvs.testing.observer_contract import observer_contract_tests
+from pano_mvs.testing.reader_contract import reader_contract_tests
 from pano_mvs.testing.stage_calls import Call, StageCase, digest_of
 from pano_mvs.testing.sweep_backends import CASES, agreement, cost_of_case, sweep_case
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
-__all__ = ["ContractTest", "backend_contract_tests", "check_stage", "cost_contract_tests", "stage_contract_tests"]
-
-
-@dataclass(frozen=True, slots=True)
-class ContractTest:
-    """A test of a contract."""
-
-    name: str
-    check: Callable[[], None]
-
-    def __str__(self) -> str:
-        """Return the name, which test runners show."""
-        return self.name
+__all__ = [
+    "ContractTest",
+    "backend_contract_tests",
+    "check_stage",
+    "command_contract_tests",
+    "cost_contract_tests",
+    "executor_contract_tests",
+    "observer_contract_tests",
+    "reader_contract_tests",
+    "stage_contract_tests",
+]
 
 
 def cost_contract_tests(cost: Path | str) -> list[ContractTest]:
@@ -69,7 +75,7 @@ def cost_contract_tests(cost: Path | str) -> list[ContractTest]:
     }
     return [
         ContractTest(f"{name} {what}", partial(check, name))
-        for name in _names("sweep cost", cost)
+        for name in registered_names("sweep cost", cost)
         for what, check in checks.items()
     ]
 
@@ -81,7 +87,7 @@ def backend_contract_tests(backend: Path | str, *, device: str = "auto") -> list
     """
     return [
         contract_test
-        for name in _names("sweep backend", backend)
+        for name in registered_names("sweep backend", backend)
         for contract_test in (
             ContractTest(f"{name} agrees with the numpy backend", partial(_backend_agrees, name, device)),
             ContractTest(f"{name} returns the same when called again", partial(_backend_is_a_function, name, device)),
@@ -144,17 +150,6 @@ def _registered(name: str) -> SweepCost:
     if name in BUILTIN:
         raise UsageError(f"the sweep cost {name!r} is built in: each backend has its own implementation of it")
     return SWEEP_COSTS.get(name)
-
-
-def _names(kind: str, part: Path | str) -> list[str]:
-    if isinstance(part, str):
-        return [part]
-    registry = Registry()
-    registry.add_file(part)
-    names = [name for known, name in registry.registrations if known == kind]
-    if not names:
-        raise UsageError(f"{part} registers no {kind}")
-    return names
 
 
 Stage = StageSpec | Callable[..., Any] | ModuleType | Path | str

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pano_mvs.cli.plugins.new import KINDS, rendered
+from pano_mvs.cli.plugins.new import EXAMPLES, KINDS, rendered
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing import conformance
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
-from tests.cli.conftest import Command, deliverables
+from tests.cli.conftest import Command, deliverables, run_json
+from tests.engine.conftest import Toy
 
 ROOT = Path(__file__).parent.parent.parent
 WORKFLOW = """\
@@ -45,15 +50,18 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("mine")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_new_plugin_keeps_its_contract(written: Path, kind: str) -> None:
-    contract_tests = getattr(conformance, KINDS[kind].contract_tests)(written / f"new_{kind}.py")
+    example = {"example": EXAMPLES[kind].format(name=f"new_{kind}")} if kind in EXAMPLES else {}
+    contract_tests = getattr(conformance, KINDS[kind].contract_tests)(written / f"new_{kind}.py", **example)
     assert len(contract_tests) >= 2
     for contract_test in contract_tests:
         contract_test.check()
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mine")
 def test_new_plugins_run_in_a_workflow(pano_mvs: Command, written: Path) -> None:
     files = ", ".join(str(written / f"new_{kind}.py") for kind in KINDS)
     images = tiny_capture(Variant((32, 64))).folder / "images"
@@ -63,6 +71,77 @@ def test_new_plugins_run_in_a_workflow(pano_mvs: Command, written: Path) -> None
     found = deliverables(Path("out/mine"))
     assert len([name for name in found if name.startswith("new_export/")]) == 4
     assert len(found["cloud.ply"]) > 40_000
+
+
+def written_into(folder: Path, kind: str) -> None:
+    (folder / f"mine_{kind}.py").write_text(rendered(kind, f"mine_{kind}")[0])
+
+
+def test_a_new_command_prints_the_cameras_of_a_run(
+    pano_mvs: Command, mine: Path, quickstart: tuple[Path, str], toy: Toy
+) -> None:
+    written_into(mine, "command")
+    result = pano_mvs("mine_command", quickstart[0])
+    assert result.code == 0, result.text
+    assert [line.partition(",")[0] for line in result.text.splitlines()] == [
+        "image",
+        *(f"{n:03d}.png" for n in range(4)),
+    ]
+    assert pano_mvs("mine_command", quickstart[0], "--doubtful").text == "image,x,y,z\n"
+    assert pano_mvs("run", toy.folder / "wf.yaml", "--out", "toy").code == 0
+    result = pano_mvs("mine_command", "toy")
+    assert (result.code, result.flat[:37]) == (2, "error: toy: this run has no poses; run"[:37])
+
+
+def test_a_new_executor_rests_after_each_unit(
+    pano_mvs: Command, mine: Path, toy: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written_into(mine, "executor")
+    rests: list[float] = []
+    monkeypatch.setattr("time.sleep", rests.append)
+    result = pano_mvs("run", toy.folder / "wf.yaml", "--executor", "mine_executor")
+    assert result.code == 0, result.text
+    assert len(rests) >= 28
+    result = pano_mvs("run", toy.folder / "wf.yaml", "--mine_executor-rest", "much")
+    assert result.code == 2
+    assert "--mine_executor-rest much: must be a number such as 0.5" in result.flat
+
+
+def test_a_new_observer_writes_how_runs_have_ended(pano_mvs: Command, mine: Path, toy: Toy) -> None:
+    written_into(mine, "observer")
+    toy.number("3.txt", "13")
+    arguments = ("run", toy.folder / "wf.yaml", "--executor", "serial", "--mine_observer", "runs.txt")
+    assert pano_mvs(*arguments).code == 3
+    assert pano_mvs(*arguments, "--workers", "2").code == 2
+    first, second = (line.split("\t") for line in Path("runs.txt").read_text().splitlines())
+    assert first[2].startswith("exit code 3, finished, ")
+    assert first[3:] == ["scaled:3.txt"]
+    assert second[2].startswith("exit code 2, --executor serial runs one unit at a time")
+    result = pano_mvs(*arguments[:-1], "no/such/runs.txt")
+    assert result.code == 3
+    assert "warning: no/such/runs.txt: cannot be written (No such file or directory)" in result.flat
+
+
+def test_a_new_pose_reader_reads_its_example(mine: Path, tmp_path: Path) -> None:
+    written_into(mine, "pose_reader")
+    Registry.installed()
+    path = tmp_path / "poses.txt"
+    path.write_text(EXAMPLES["pose_reader"].format(name="mine_pose_reader"))
+    poses = read_poses(path)
+    assert poses.names == ("a.jpg", "b.jpg")
+    np.testing.assert_allclose(poses.centers, [(1.5, 2.0, 1.7), (2.5, 2.0, 1.7)])
+    east = poses.cameras["a.jpg"].apply([11.5, 2.0, 0.7])  # ten metres in front, one below
+    np.testing.assert_allclose(east, [0, 1, 10], atol=1e-12)
+
+
+def test_a_new_capture_reader_reads_its_list(pano_mvs: Command, mine: Path, toy: Toy) -> None:
+    written_into(mine, "capture_reader")
+    shutil.copytree(tiny_capture(Variant((32, 64))).folder / "images", "attic")
+    Path("photos.txt").write_text("# mine_capture_reader: one image per line\nattic/001.png\nattic/002.png\n")
+    Path("look.yaml").write_text("pano_mvs: 1\nstages: {images: {use: source.folder, path: photos}}\n")
+    result = pano_mvs("run", "look.yaml", "--images", "photos.txt", "--executor", "serial")
+    assert result.code == 0, result.text
+    assert [stage["units"] for stage in run_json(Path("out/look"))["stages"]] == [2]
 
 
 def test_new_plugins_are_clean(written: Path) -> None:
@@ -91,6 +170,14 @@ def test_the_command_writes_both_files_and_overwrites_none(pano_mvs: Command) ->
     assert result.code == 2
     assert "test_mine.py already exists" in result.flat
     assert not Path("plugins/here/mine.py").exists()
+
+
+def test_the_command_says_how_a_plugin_beside_stages_is_used(pano_mvs: Command) -> None:
+    result = pano_mvs("plugin", "new", "observer", "bell", "--dir", "here")
+    assert result.code == 0, result.text
+    assert (
+        "put bell.py into a folder that $PANO_MVS_PLUGINS names, and run pano-mvs run quickstart --bell" in result.flat
+    )
 
 
 @pytest.mark.parametrize(

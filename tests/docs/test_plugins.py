@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,17 @@ from typer.testing import CliRunner
 from pano_mvs import api
 from pano_mvs.api import Context, RunStoppedError, TwoView
 from pano_mvs.cli.app import app
-from pano_mvs.cli.plugins.new import KINDS, rendered
-from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.cli.plugins.listing import DOORS
+from pano_mvs.cli.plugins.new import EXAMPLES, KINDS, rendered
+from pano_mvs.engine.stages.registry import ENTRY_POINT_GROUP, Registry
 from pano_mvs.scene import RangeMap, Record
+from pano_mvs.testing import conformance
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.docs.pages import block, copy_plugin, text_of
 from tests.synthetic.capture_files import write_capture
+from tests.test_plugin_imports import PUBLIC
 
 PAGE = text_of("plugins.md")
 PLUGINS = dict(re.findall(r"<!-- plugin: (\w+) (\w+) -->\n", PAGE))
@@ -31,11 +36,48 @@ def test_the_page_has_one_plugin_of_each_kind() -> None:
     assert PLUGINS.keys() == KINDS.keys()
 
 
+BESIDE_STAGES = [kind for kind in KINDS if not KINDS[kind].in_workflow]
+
+
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize("kind", BESIDE_STAGES)
+def test_an_example_beside_stages_keeps_its_contract(kind: str, tmp_path: Path) -> None:
+    name = PLUGINS[kind]
+    plugin = tmp_path / f"{name}.py"
+    plugin.write_text(rendered(kind, name)[0])
+    example = {"example": EXAMPLES[kind].format(name=name)} if kind in EXAMPLES else {}
+    for contract_test in getattr(conformance, KINDS[kind].contract_tests)(plugin, **example):
+        contract_test.check()
+
+
+@pytest.mark.parametrize("kind", ["command", "executor", "observer", "pose_reader"])
+def test_an_example_beside_stages_is_short(kind: str) -> None:
+    assert len(rendered(kind, PLUGINS[kind])[0].splitlines()) < 40
+
+
+def test_the_page_lists_the_groups_of_all_doors() -> None:
+    table = re.findall(r"^\| `(pano_mvs\.\w+)` \| (?:a|an) ", PAGE.partition("### Offered by")[2], re.MULTILINE)
+    assert set(table) == {ENTRY_POINT_GROUP, *(door.group for door in DOORS)}
+    example = tomllib.loads(block("plugins.md", "entry points"))["project"]["entry-points"]
+    assert example.keys() <= set(table)
+
+
+def test_the_page_lists_the_public_modules() -> None:
+    table = PAGE.partition("<!-- public modules -->")[2].partition("\n\n")[0]
+    listed = set(re.findall(r"^\| `([\w.*]+)`", table, re.MULTILINE))
+    assert listed == {*PUBLIC, "pano_mvs.core.*", "pano_mvs.testing.conformance"}
+    for module, names in re.findall(r"^\| `([\w.]+)` \| (.*) \|$", table, re.MULTILINE):
+        for name in re.findall(r"`(\w+)`", names):
+            assert hasattr(import_module(module), name), f"{module}.{name}"
+    kinds = set(re.findall(r"^\| .* \| `register_\w+` \| .* \| `(\w+)` \|$", PAGE, re.MULTILINE))
+    assert kinds == {KINDS[kind].contract_tests for kind in BESIDE_STAGES}
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_page_names_the_command_that_writes_a_plugin(kind: str) -> None:
     text, command = rendered(kind, PLUGINS[kind])[0], f"pano-mvs plugin new {kind} {PLUGINS[kind]}"
     assert f"`{command}` writes [this plugin](../pano_mvs/cli/plugins/templates/{kind}.py.jinja)" in PAGE
-    assert re.findall(r'^@\w+\(\s*"(?:\w+\.)*(\w+)"', text, re.MULTILINE) == [PLUGINS[kind]]
+    assert set(re.findall(r'^@\w+\(\s*"(?:\w+\.)*(\w+)"', text, re.MULTILINE)) == {PLUGINS[kind]}
 
 
 def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

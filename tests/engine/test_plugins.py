@@ -28,15 +28,6 @@ def same(x: Each[RangeMap]) -> RangeMap:
 BROKEN = "from pano_mvs.api import *\nLIMIT = 1 / 0\n" + STAGE.format(name="filters.unlucky")
 
 
-@pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's plugin folder."""
-    folder = tmp_path / "mine"
-    folder.mkdir()
-    monkeypatch.setenv("PANO_MVS_PLUGINS", str(folder))
-    return folder
-
-
 def command(*arguments: str | Path) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     return result.exit_code, " ".join(result.output.split())
@@ -154,6 +145,19 @@ def test_a_plugin_of_the_folder_goes_along_to_workers(mine: Path, toy: Toy, monk
     assert list(toy.session().workflow.plugins) == [mine / "plug.py"]
     assert ran(toy.run())["scaled"] == 5
     assert ran(toy.run()) == {}
+
+
+def test_what_no_worker_needs_does_not_go_along(mine: Path, toy: Toy) -> None:
+    """Libraries of an observer need not be installed where units are computed."""
+    (mine / "bell.py").write_text(
+        "from pano_mvs.session.observers import register_observer\n\n"
+        '@register_observer("bell", help="Ring.")\ndef bell(values, run): ...\n'
+    )
+    (mine / "walk.py").write_text(
+        "from pano_mvs.io.readers import register_pose_reader\n\n"
+        '@register_pose_reader("walk", what="a walk", recognises=lambda path: False)\ndef walk(path): ...\n'
+    )
+    assert set(toy.session().workflow.plugins) == {toy.folder / "plug.py", mine / "walk.py"}
 
 
 def test_a_relative_plugin_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

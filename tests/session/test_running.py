@@ -204,7 +204,7 @@ def test_errors_name_arguments_and_not_options(toy: Toy) -> None:
 
 def test_execution_takes_the_place_of_the_name_of_an_executor(toy: Toy) -> None:
     assert run_toy(toy, executor=Execution("serial", threads=3)).summary.executor["threads"] == 3
-    with pytest.raises(pano_mvs.UsageError, match=r"there is no executor 'nothing'; choose one of serial, processes"):
+    with pytest.raises(pano_mvs.UsageError, match=r"there is no executor 'nothing'; known: serial, processes"):
         run_toy(toy, executor=Execution("nothing"))
 
 

@@ -17,7 +17,7 @@ from pano_mvs.cli.endings import guarded
 from pano_mvs.core.errors import UsageError, WorkflowError
 
 if TYPE_CHECKING:  # a command loads what it needs itself
-    from pano_mvs.engine.stages.registry import Plugin, Registry
+    from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.engine.stages.stage import StageSpec
 
 plugin_app = typer.Typer(help="Create plugins.", no_args_is_help=True)
@@ -34,13 +34,20 @@ FileOption = Annotated[
 
 
 @guarded
-def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
-    """List all plugins with their origin, whether they can be loaded, and their stages."""
+def plugins(
+    workflow: WorkflowOption = None,
+    files: FileOption = None,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Also load what plugins offer beside stages; exit code 2 if anything is broken."),
+    ] = False,
+) -> None:
+    """List all plugins with their origin, whether they can be loaded, and what they bring."""
+    from pano_mvs.cli.plugins.listing import broken_reasons, entry_problems, plugin_rows, plugin_table
+
     console, (registry, _) = Console(), _registry(workflow, files or [])
-    found = Table("plugin", "", "gives")
-    for plugin in registry.plugins:
-        found.add_row(escape(plugin.origin), "[red]broken[/]" if plugin.error else "ok", _gives(plugin))
-    console.print(found)
+    problems = entry_problems(check=check)
+    console.print(plugin_table(plugin_rows(registry, problems)))
     table = Table("stage", "version", "from", "")
     for name, spec in sorted(registry.stages.items()):
         doc = spec.doc.splitlines()[0] if spec.doc else ""
@@ -50,8 +57,11 @@ def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
         console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
     for clash in registry.clashes.values():
         console.say(f"[red]twice:[/] {escape(clash)}")
-    for plugin in registry.broken:
-        console.say(f"[red]broken:[/] {escape(plugin.why_broken())}")
+    broken = broken_reasons(registry, problems)
+    for reason in dict.fromkeys(broken):
+        console.say(f"[red]broken:[/] {escape(reason)}")
+    if check and (broken or registry.clashes):
+        raise typer.Exit(UsageError.exit_code)
 
 
 @stage_app.command("show")
@@ -109,13 +119,6 @@ def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, Wo
     except WorkflowError as error:  # the plugins can be shown nevertheless
         return registry, error
     return registry, None
-
-
-def _gives(plugin: Plugin) -> str:
-    stages = [name for kind, name in plugin.names if kind == "stage"]
-    others = [f"{kind} {name}" for kind, name in plugin.names if kind != "stage"]
-    counted = [f"{len(stages)} stages"] if len(stages) > 3 else stages
-    return escape(", ".join([*counted, *others]))
 
 
 def _type_name(schema: dict[str, object]) -> str:

@@ -18,6 +18,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_given
 from pano_mvs.core.paths import exists
+from pano_mvs.core.plugin_folders import PLUGINS_VARIABLE
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -26,11 +27,12 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 class PluginKind:
     """A kind of plugin."""
 
-    prefix: str  # of the stage's name; empty for a part of the sweep
+    prefix: str  # of the stage's name; empty for what is not a stage
     what: str
-    use: str  # how a workflow uses it, with `{name}` for its name
+    use: str  # how a workflow, or the command line, uses it, with `{name}` for its name
     # the function of `pano_mvs.testing.conformance` that returns its contract tests
     contract_tests: str = "stage_contract_tests"
+    in_workflow: bool = True  # whether a workflow uses it; otherwise `use` is a command
 
 
 KINDS = {
@@ -57,7 +59,43 @@ KINDS = {
     "filter": PluginKind("filters", "turns a range map into another", "filtered: {{use: filters.{name}}}"),
     "fusion": PluginKind("fusion", "merges range maps into a cloud", "cloud: {{use: fusion.{name}}}"),
     "export": PluginKind("export", "files for other programs", "written: {{use: export.{name}}}"),
+    "command": PluginKind(
+        "", "a command", "pano-mvs {name} out/quickstart", "command_contract_tests", in_workflow=False
+    ),
+    "executor": PluginKind(
+        "",
+        "when and where units are computed",
+        "pano-mvs run quickstart --executor {name}",
+        "executor_contract_tests",
+        in_workflow=False,
+    ),
+    "observer": PluginKind(
+        "",
+        "receives the events of a run",
+        "pano-mvs run quickstart --{name} runs.txt",
+        "observer_contract_tests",
+        in_workflow=False,
+    ),
+    "capture_reader": PluginKind(
+        "",
+        "another kind of capture",
+        "pano-mvs run quickstart --images photos.txt",
+        "reader_contract_tests",
+        in_workflow=False,
+    ),
+    "pose_reader": PluginKind(
+        "",
+        "poses of another program",
+        "pano-mvs run known_poses --images photos --set poses.path=poses.txt",
+        "reader_contract_tests",
+        in_workflow=False,
+    ),
 }
+EXAMPLES = {
+    "pose_reader": "# {name}: image, x east, y north, z up, heading clockwise from north\n"
+    "a.jpg, 1.5, 2.0, 1.7, 90\nb.jpg, 2.5, 2.0, 1.7, 135.5\n"
+}
+"""A file that the plugin of a kind reads, with `{name}` for its name."""
 
 
 def rendered(kind: str, name: str) -> tuple[str, str]:
@@ -83,6 +121,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         "kind": kind,
         "contract_tests": KINDS[kind].contract_tests,
         "prefix": KINDS[kind].prefix,
+        "example": EXAMPLES.get(kind, "").format(name=name),
     }
     return (
         environment.get_template(f"{kind}.py.jinja").render(values),
@@ -105,15 +144,19 @@ def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> Non
     for path, text in zip(paths, (plugin, test), strict=True):
         write_given(path, text, f"--dir {folder}")
     console.say(f"wrote {escape(str(paths[0]))} and its test")
-    console.print("use it in a workflow:", highlight=False)
-    console.print(f"  plugins: [{name}.py]", highlight=False, markup=False)
-    console.print(f"  stages:\n    {KINDS[kind].use.format(name=name)}", highlight=False, markup=False)
+    use = KINDS[kind].use.format(name=name)
+    if KINDS[kind].in_workflow:
+        console.print("use it in a workflow:", highlight=False)
+        console.print(f"  plugins: [{name}.py]\n  stages:\n    {use}", highlight=False, markup=False)
+    else:
+        console.say(f"use it: put {name}.py into a folder that ${PLUGINS_VARIABLE} names, and run")
+        console.print(f"  {use}", highlight=False, markup=False, soft_wrap=True)
     console.say(f"test it: pytest {escape(str(paths[1]))}")
 
 
 def show_kinds(console: Console) -> None:
     """List the kinds of plugins."""
-    table = Table("kind", "purpose", "in a workflow")
+    table = Table("kind", "purpose", "use, in a workflow or as a command")
     for name, kind in KINDS.items():
         table.add_row(name, kind.what, escape(kind.use.format(name="mine")))
     console.print(table)

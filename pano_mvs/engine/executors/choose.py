@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from pano_mvs.core.doors import Door, RunOption
-from pano_mvs.core.errors import PluginError, UsageError
+from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.memory import free_memory_bytes, total_memory_bytes
+from pano_mvs.core.text import error_summary
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.processes import ProcessExecutor
@@ -23,7 +24,8 @@ class ExecutorRequest:
     name: str = ""  # of the executor; one plugin may offer several that differ little
     workers: int = 0  # number of units at a time; 0 for as many as cores and memory (3 GB each) allow
     threads: int = 0  # threads of each worker; 0 for an equal share of the cores
-    options: Mapping[str, str] = field(default_factory=dict)  # the executor's own options, without the dashes
+    # the executor's own options, without the dashes, to their values; "" for a flag, the last of several values
+    options: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,17 +141,12 @@ def chosen(request: ExecutorRequest) -> tuple[ExecutorKind, ExecutorRequest]:
     workers is given), else processes.
 
     Raises:
-        UsageError: if there is none, or it has no such option.
+        UsageError: if there is no such executor, or it has no such option.
         PluginError: if it cannot be loaded.
     """
     name = request.name or _owner(request.options) or ("" if request.workers else os.environ.get(VARIABLE, ""))
     name = name or "processes"
-    try:
-        kind = EXECUTORS.get(EXECUTORS.check(name))
-    except PluginError:
-        raise
-    except UsageError as error:
-        raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS.names())}") from error
+    kind = EXECUTORS.get(name)
     own = {option.name for option in kind.options}
     for option in request.options:
         if option not in own:
@@ -176,10 +173,17 @@ def make_executor(store: Store, request: ExecutorRequest = ExecutorRequest()) ->
 
     Raises:
         UsageError: if the request contradicts itself, or the executor is not installed or cannot be reached.
-        PluginError: if its plugin cannot be loaded.
+        PluginError: if its plugin cannot be loaded, or fails.
     """
     kind, request = chosen(request)
-    return kind.make(store, request)
+    try:
+        return kind.make(store, request)
+    except (PanoMvsError, OSError):
+        raise
+    except Exception as error:
+        raise PluginError(
+            f"the executor {request.name!r} ({EXECUTORS.origin(request.name)}) cannot start: {error_summary(error)}"
+        ) from error
 
 
 def executor_size(request: ExecutorRequest) -> ExecutorSize:

@@ -75,6 +75,16 @@ class RegisteredIn:
         return handler(core) | {"enum": list(self.registry.names())}
 
 
+@dataclass(frozen=True)
+class ReadBy:
+    """Marks a path that a plugin may read: the code of the plugin that reads it counts towards the cache key.
+
+    path: Annotated[InputPath, ReadBy(file_of_reader)]
+    """
+
+    file_of_reader: Callable[[Path], Path | None]  # returns the plugin's file for a path; None if no plugin reads it
+
+
 def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     """Return the fields that count towards the cache key: plain values, and paths that count by content."""
     plain: dict[str, Any] = {}
@@ -107,11 +117,19 @@ def _placed(value: Any, place: Callable[[Path], Path]) -> Any:
 
 
 def registered_files(params: Params) -> dict[str, Path]:
-    """Return each setting that holds a name registered by a plugin, and the plugin's file, whose code counts."""
+    """Return each setting with a name that a plugin registered, or a path that one reads, and the plugin's file.
+
+    The code of that file counts.
+    """
     found: dict[str, Path] = {}
     for name, field in type(params).model_fields.items():
-        for mark in field.metadata:
-            if isinstance(mark, RegisteredIn) and (file := mark.registry.code_file(getattr(params, name))) is not None:
+        value, file = getattr(params, name), None
+        for mark in _marks(field.annotation, field.metadata):
+            if isinstance(mark, RegisteredIn):
+                file = mark.registry.code_file(value)
+            elif isinstance(mark, ReadBy) and value is not None:
+                file = mark.file_of_reader(value)
+            if file is not None:
                 found[name] = file
     return found
 

@@ -10,7 +10,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Collection, Iterator
-from contextlib import nullcontext, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
@@ -18,16 +18,18 @@ from pathlib import Path
 from types import ModuleType
 
 from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.doors import load_entry, origin_of
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.plugin_folders import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.core.process_state import restored_state
-from pano_mvs.core.text import error_text, shortened
+from pano_mvs.core.text import error_summary, error_text, shortened
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
 from pano_mvs.engine.stages.stage_code import code_digest
 
 ENTRY_POINT_GROUP = "pano_mvs.plugins"
+_OF_THE_RUN = ("command", "executor", "observer")  # registrations that no worker needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +122,12 @@ class Registry:
     def files_behind(self, stages: Collection[str]) -> dict[Path, str]:
         """Return the plugin files that some stages need, with the digests of their code.
 
-        A file with registrations beside stages is always included, because any stage may use them.
+        A file with registrations beside stages is always included if any stage may use them.
         """
         return {
             path: digest
             for path, (digest, plugin) in self._files.items()
-            if any(kind != "stage" or name in stages for kind, name in plugin.names)
+            if any(name in stages if kind == "stage" else kind not in _OF_THE_RUN for kind, name in plugin.names)
         }
 
     def suggest(self, name: str) -> str:
@@ -137,11 +139,9 @@ class Registry:
         return "\n".join([hint, *(plugin.why_broken() for plugin in self.broken)])
 
     def _load_entry_point(self, entry: EntryPoint) -> None:
-        origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+        origin = origin_of(entry)
         try:
-            ours = entry.value.partition(".")[0] == "pano_mvs"
-            with redirect_stdout(sys.stderr), nullcontext() if ours else restored_state():
-                module = entry.load()
+            module = load_entry(entry)
             if not isinstance(module, ModuleType):
                 raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
             clashes = self._clashes(module, own_only=False)
@@ -200,7 +200,7 @@ class Registry:
 
 
 def _broken(origin: str, error: BaseException) -> Plugin:
-    summary = shortened(" ".join(f"{type(error).__name__}: {error_text(error)}".split()))
+    summary = shortened(error_summary(error))
     return Plugin(origin, (), summary, _trace(error))
 
 

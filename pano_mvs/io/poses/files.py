@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import unwrap
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from pano_mvs.io.poses.metashape import read_metashape
 from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
 from pano_mvs.io.poses.positions import NO_POSES, csv_cells, holds_positions, latitude_heading, read_positions
 from pano_mvs.io.poses.trajectories import SUFFIXES, match_times, read_trajectory
-from pano_mvs.io.readers import pose_reader_of
+from pano_mvs.io.readers import pose_reader_of, poses_of_plugin
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
@@ -95,8 +96,7 @@ def _groups_in(path: Path) -> list[Poses]:
 
 
 def _read_file(path: Path) -> FilePoses:
-    if exists(path) and (reader := pose_reader_of(path)) is not None:
-        found = reader.read(path)
+    if (found := poses_of_plugin(path)) is not None:
         return FilePoses([dict(group) for group in found.groups], dict(found.others), metric=found.metric)
     suffix = path.suffix.lower()
     if suffix == ".csv":
@@ -185,16 +185,28 @@ def match_images(images: Sequence[str], names: Sequence[str], path: Path) -> tup
 
     Names are compared by `match_image_names`; those of a trajectory are times, see `match_times`.
     """
-    if path.suffix.lower() not in SUFFIXES or is_folder(path):
+    if path.suffix.lower() not in SUFFIXES or is_folder(path) or pose_reader_of(path) is not None:
         return match_image_names(images, names), ""
     matched, how = match_times(images, names, path)
     return matched, f"the poses in {path.name} belong to the images by {how}"
 
 
+def file_of_reader(path: Path) -> Path | None:
+    """Return the Python file of the plugin that reads a file of poses or positions; None if no plugin reads it."""
+    try:
+        path = _file_or_model(path)
+    except InputError:
+        return None
+    reader = None if is_folder(path) else pose_reader_of(path)
+    code = None if reader is None else getattr(unwrap(reader.read), "__code__", None)
+    return None if code is None else Path(code.co_filename)
+
+
 def recorded_pictures(path: Path) -> dict[str, str]:
     """Return the SHA-256 of the images of poses by name, if the file states them (poses.json)."""
     path = _file_or_model(path)
-    value = read_json_value(path) if path.suffix.lower() in _JSON else None
+    is_ours = path.suffix.lower() in _JSON and pose_reader_of(path) is None
+    value = read_json_value(path) if is_ours else None
     if not isinstance(value, dict) or "views" not in value or any(keys <= value.keys() for keys, _ in _BY_KEYS):
         return {}
     return {view.name: view.sha256 for view in posed_views(value, path)[0] if view.sha256 is not None}
