@@ -1,0 +1,225 @@
+"""The way from a delivered file back to the unit that made it, and to the images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from pano_mvs.core.digest import digest_from_file
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file
+from pano_mvs.engine.cache.store import UnitRecord
+from pano_mvs.engine.planning.plan import RunOptions
+from pano_mvs.results.summary import RUN_JSON
+from pano_mvs.session.running import Execution, run_session
+from pano_mvs.session.session import reopen
+from pano_mvs_lineage.diff import digests_in
+from pano_mvs_lineage.stored_runs import StoredRun, find_runs
+
+_BY_THE_RUN = ("run.json", "report.html")
+
+
+@dataclass(frozen=True)
+class UnitOrigin:
+    """A unit that leads to a file."""
+
+    stage: str  # its name in the workflow
+    use: str  # the registered stage
+    item: str  # image, pair or view; empty if the stage has one unit
+    key: str  # in the cache
+    settings: Mapping[str, Any]
+    code: str  # digest of the code that computed it
+    libraries: Mapping[str, str]
+    seconds: float  # that it took
+    depth: int = 0  # number of units between it and the file
+
+    @property
+    def label(self) -> str:
+        """`STAGE:ITEM`, or `STAGE` if the stage has one unit."""
+        return f"{self.stage}:{self.item}" if self.item else self.stage
+
+
+@dataclass(frozen=True)
+class FileOrigin:
+    """Where a file comes from."""
+
+    file: Path
+    name: str  # of the file in the output folder of its run
+    out: Path
+    workflow: str
+    started: str
+    version: str  # of pano_mvs
+    units: tuple[UnitOrigin, ...]  # the one that made the file first, then those that it depends on, nearest first
+    images: Mapping[str, str]  # path of each image that it depends on to its digest; of the whole run if unknown
+    was_changed: bool = False  # whether the file has other bytes than the run wrote
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the origin as JSON values."""
+        return asdict(self) | {"file": str(self.file), "out": str(self.out)}
+
+    def lines(self) -> list[str]:
+        """Return the origin as text."""
+        lines = [
+            f"{self.file}: {self.name} of the run into {self.out}",
+            f"workflow {self.workflow}, started {self.started}, pano_mvs {self.version}",
+        ]
+        if self.was_changed:
+            lines.append("the file has other bytes than the run wrote: it was changed since")
+        for unit in self.units:
+            settings = ", ".join(f"{name}={value}" for name, value in unit.settings.items()) if unit.depth == 0 else ""
+            lines.append(f"{'  ' * min(unit.depth, 1)}{unit.label} ({unit.use}), {unit.seconds:.2f} s, {unit.key[:12]}")
+            lines += [f"  settings: {settings}"] if settings else []
+            lines += [f"  code: {unit.code}"] if unit.depth == 0 and unit.code else []
+        lines.append(f"images: {', '.join(Path(path).name for path in self.images)}")
+        return [*lines, *self.notes]
+
+
+def why(file: str | Path, *, runs: Iterable[str | Path] = (), cache: str | Path | None = None) -> FileOrigin:
+    """Return where a delivered file comes from: its run, the unit that made it, and all that this depends on.
+
+    A file in the output folder of a run is found by its place. One that was copied elsewhere is found by its content
+    among the runs in the folders `runs`.
+
+    >>> import pano_mvs
+    >>> pano_mvs.why("out/range/000.tiff").units[0].label  # doctest: +SKIP
+    'ranges:000.png'
+
+    Args:
+        runs: folders in which runs are looked for, if the file lies in none.
+        cache: of the run; None for the one that run.json names.
+
+    Raises:
+        InputError: if the file does not exist, or no run has written it.
+    """
+    path = Path(file)
+    if not is_file(path):
+        raise InputError(f"{path}: there is no such file. Give a file that a run has written")
+    root = None if cache is None else Path(cache)
+    place = _run_above(path)
+    if place is not None:
+        run, name = StoredRun.open(place, root), path.absolute().relative_to(place.absolute()).as_posix()
+        if name in run.summary.files:
+            return _origin(path, name, run, was_changed=digest_from_file(path) != run.summary.files[name])
+        if name in _BY_THE_RUN:
+            note = f"{name} is written at the end of each run, from the results of all stages"
+            return _origin(path, name, run, note=note)
+        if not runs:
+            raise InputError(f"{path}: the run into {place} has not written this file, or an earlier run has")
+    digest = digest_from_file(path)
+    for out in find_runs([Path(folder) for folder in runs or (".",)]):
+        try:
+            run = StoredRun.open(out, root)
+        except InputError:
+            continue
+        for name, own in run.summary.files.items():
+            if own == digest:
+                return _origin(path, name, run)
+    searched = ", ".join(map(str, runs)) or "the current folder"
+    raise InputError(f"{path}: no run in {searched} has written a file with this content. Name its folder with --runs")
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A unit that was computed again."""
+
+    label: str
+    is_same: bool  # whether it made the same bytes
+    seconds: float
+
+
+def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
+    """Compute the unit that made a file again, alone, and compare its bytes.
+
+    Raises:
+        UsageError: if the unit is not known, or its workflow has changed so that it would have another key.
+        InputError: if the workflow or the images of the run are no longer there.
+    """
+    if not origin.units:
+        raise UsageError(
+            f"{origin.file}: the unit that made it is not known, because the cache of the run is not there"
+        )
+    unit = origin.units[0]
+    session = reopen(str(origin.out), overrides=[], images=None, cache=None if cache is None else Path(cache))
+    before = StoredRun.open(origin.out, session.store_root).record(unit.stage, unit.item)
+    with TemporaryDirectory(prefix="pano-mvs-why-") as folder:
+        options = RunOptions(only=(unit.label,), refresh=(unit.label,))
+        output = run_session(
+            replace(session, out=Path(folder) / "out", run_options=options), Execution(executor="serial")
+        )
+        after = StoredRun.open(Path(folder) / "out", session.store_root).record(unit.stage, unit.item)
+    if before is None or after is None or before.key != after.key:
+        raise UsageError(
+            f"{unit.label} cannot be computed again as it was: the workflow, the code or the images have changed since"
+        )
+    seconds = next((stage.unit_seconds or 0.0 for stage in output.summary.stages if stage.name == unit.stage), 0.0)
+    return Repeated(unit.label, before.output.digest == after.output.digest, seconds)
+
+
+def _run_above(path: Path) -> Path | None:
+    """Return the output folder of the run in which a file lies, or None."""
+    folders = path.absolute().parents
+    return next((folder for folder in folders if is_file(folder / RUN_JSON)), None)
+
+
+def _origin(path: Path, name: str, run: StoredRun, *, was_changed: bool = False, note: str = "") -> FileOrigin:
+    summary = run.summary
+    notes = [*run.notes, *([note] if note else [])]
+    units: tuple[UnitOrigin, ...] = ()
+    if not note:
+        found = _maker(run, summary.files[name])
+        if found is None and run.store is not None:
+            notes.append("the cache no longer has the unit that made it")
+        units = tuple(_with_sources(run, *found)) if found is not None else ()
+    images = dict(summary.inputs)
+    used = {unit.item for unit in units if unit.use.startswith("source.")}
+    if used:
+        images = {image: digest for image, digest in images.items() if _is_one_of(image, used)} or images
+    about = {"workflow": summary.workflow.name, "started": summary.started, "version": summary.version}
+    return FileOrigin(
+        path, name, run.out, **about, units=units, images=images, was_changed=was_changed, notes=tuple(notes)
+    )
+
+
+def _is_one_of(path: str, items: Iterable[str]) -> bool:
+    place = path.replace(os.sep, "/")
+    return any(place == item or place.endswith(f"/{item}") for item in items)
+
+
+def _maker(run: StoredRun, digest: str) -> tuple[str, str, UnitRecord] | None:
+    """Return the stage, the item and the record of the unit that delivered a file with a digest."""
+    for stage in run.keys:
+        for item, record in run.records(stage):
+            if any(part.digest == digest for part in record.output.parts.values()):
+                return stage, item, record
+    return None
+
+
+def _with_sources(run: StoredRun, stage: str, item: str, record: UnitRecord) -> Iterator[UnitOrigin]:
+    """Yield a unit and all units that it depends on, the nearest first."""
+    uses = {outcome.name: outcome.use for outcome in run.summary.stages}
+    pending, seen = [(stage, item, record, 0)], {(stage, item)}
+    while pending:
+        name, unit, made, depth = pending.pop(0)
+        identity = made.identity
+        yield UnitOrigin(
+            name,
+            uses.get(name, str(identity.get("stage", ""))),
+            unit,
+            made.key,
+            dict(identity.get("params") or {}),
+            str(identity.get("code") or ""),
+            dict(identity.get("libraries") or {}),
+            made.seconds,
+            depth,
+        )
+        for port, value in (identity.get("inputs") or {}).items():
+            for digest in digests_in(value):
+                found = run.made_by(name, port, digest)
+                if found is not None and found[:2] not in seen:
+                    seen.add(found[:2])
+                    pending.append((*found, depth + 1))

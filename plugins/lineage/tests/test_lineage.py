@@ -1,0 +1,233 @@
+"""Runs are listed by what differs, compared with reasons, and files lead back to their units."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pano_mvs_lineage.diff import PoseChanges, diff
+from pano_mvs_lineage.page import diff_page
+from pano_mvs_lineage.range_changes import compare_ranges
+from pano_mvs_lineage.runs import runs
+from pano_mvs_lineage.why import repeat, why
+
+import pano_mvs as package
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.session.running import Execution, run_session
+from tests.cli.conftest import Command
+from tests.engine.conftest import Toy
+
+
+def run_into(toy: Toy, out: str, *overrides: str) -> Path:
+    """Run the toy workflow into a folder beside the others, with their cache, and return the folder."""
+    session = replace(toy.session(*overrides), out=toy.folder / "runs" / out)
+    run_session(session, Execution("serial"))
+    return session.out
+
+
+@pytest.fixture
+def two(toy: Toy) -> tuple[Toy, Path, Path]:
+    """Two runs of the toy workflow that differ in one setting."""
+    return toy, run_into(toy, "first"), run_into(toy, "second", "scaled.by=4")
+
+
+def test_runs_are_listed_with_the_settings_in_which_they_differ(two: tuple[Toy, Path, Path]) -> None:
+    toy, first, second = two
+    table = runs([toy.folder / "runs"], metrics=["scaled.value"])
+    assert [row.out for row in table.rows] == [first, second]
+    assert table.settings == ("scaled.by",)
+    assert [row.settings["scaled.by"] for row in table.rows] == [3.0, 4.0]
+    assert [row.metrics["scaled.value"] for row in table.rows] == [table.rows[0].metrics["scaled.value"]] * 2
+    backwards = runs([toy.folder / "runs"], sort="-scaled.by")
+    assert [row.out for row in backwards.rows] == [second, first]
+    assert table.to_csv().splitlines()[0] == "out,workflow,started,exit,s,registered,images,scaled.by,scaled.value"
+    assert len(json.dumps(table.to_json())) > 100
+
+
+def test_runs_that_cannot_be_read_are_named_and_left_out(two: tuple[Toy, Path, Path]) -> None:
+    toy, first, second = two
+    (second / "run.json").write_text('{"schema": 99, "stages": []}')
+    table = runs([toy.folder / "runs"])
+    assert [row.out for row in table.rows] == [first]
+    (reason,) = table.skipped
+    assert "newer version" in reason
+    (first / "run.json").write_text("[]")
+    with pytest.raises(InputError, match="no run can be read"):
+        runs([toy.folder / "runs"])
+
+
+def test_mistakes_in_lists_of_runs_name_what_there_is(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    toy, _, _ = two
+    with pytest.raises(UsageError, match=r"no run has the metric 'depth\.nothing'; there are: .*scaled\.value"):
+        runs([toy.folder / "runs"], metrics=["depth.nothing"])
+    with pytest.raises(UsageError, match="no such column; there are out, workflow"):
+        runs([toy.folder / "runs"], sort="nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no run in this folder or below it; each has a run\.json"):
+        runs([tmp_path / "empty"])
+    with pytest.raises(InputError, match="no such folder"):
+        runs([tmp_path / "nowhere"])
+
+
+def test_a_setting_that_differs_is_the_reason_for_the_units_behind_it(two: tuple[Toy, Path, Path]) -> None:
+    _, first, second = two
+    found = diff(first, second)
+    assert [str(change) for change in found.settings] == ["scaled.by: 3 → 4"]
+    assert not found.stages
+    assert not found.versions
+    assert found.reasons["scaled"] == "setting by: 3 → 4"
+    assert "images" not in found.reasons
+    assert found.reasons["difference"] == "inputs of scaled"
+    assert found.files
+    assert not found.is_same
+    assert json.loads(json.dumps(found.to_json()))["same"] is False
+    assert "why units differ:" in found.lines()
+
+
+def test_images_and_code_that_differ_are_reasons(toy: Toy) -> None:
+    first = run_into(toy, "first")
+    toy.number("1.txt", "8")
+    toy.edit("plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by"))
+    second = run_into(toy, "second")
+    found = diff(first, second)
+    assert [change.name for change in found.images] == ["1.txt"]
+    assert "code of toy.scale" in found.reasons["scaled"]
+    assert any("other content: 1.txt" in line for line in found.lines())
+
+
+def test_equal_runs_are_the_same_and_one_run_is_not_two(toy: Toy) -> None:
+    first, second = run_into(toy, "first"), run_into(toy, "second")
+    found = diff(first, second)
+    assert found.is_same
+    assert found.lines() == ["the same settings, images, code and files"]
+    with pytest.raises(UsageError, match="are the same folder"):
+        diff(first, first)
+    with pytest.raises(InputError, match=r"run\.json cannot be read"):
+        diff(first, toy.folder / "nowhere")
+
+
+def test_runs_are_compared_without_their_cache_too(two: tuple[Toy, Path, Path]) -> None:
+    toy, first, second = two
+    shutil.rmtree(toy.folder / "cache")
+    found = diff(first, second)
+    assert [change.name for change in found.settings] == ["scaled.by"]
+    assert not found.reasons
+    assert any("is not there" in note for note in found.notes)
+    assert any("is not there" in note for note in why(next(first.glob("*.txt"))).notes)
+
+
+def test_a_file_leads_back_to_its_unit_and_to_the_images(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    toy, first, _ = two
+    name = next(name for name in package.load(first).summary.files)
+    origin = why(first / name)
+    assert (origin.name, origin.out, origin.was_changed) == (name, first, False)
+    assert origin.units[0].depth == 0
+    assert {unit.stage for unit in origin.units} > {"images", "scaled"}
+    assert {Path(path).name for path in origin.images} == {path.name for path in (toy.folder / "capture").iterdir()}
+    copied = tmp_path / "elsewhere" / "copy"
+    copied.parent.mkdir()
+    shutil.copy(first / name, copied)
+    found = why(copied, runs=[toy.folder / "runs"])
+    assert (found.name, found.units) == (name, origin.units)
+    assert repeat(origin).is_same
+    (first / name).write_bytes(b"changed")
+    assert why(first / name).was_changed
+
+
+def test_what_no_run_has_written_is_refused(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    toy, first, _ = two
+    (tmp_path / "other").write_text("nothing")
+    with pytest.raises(InputError, match=r"no run in .* has written a file with this content\. Name its folder"):
+        why(tmp_path / "other", runs=[toy.folder / "runs"])
+    with pytest.raises(InputError, match="there is no such file"):
+        why(tmp_path / "nowhere")
+    (first / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="has not written this file"):
+        why(first / "mine.txt")
+    assert "at the end of each run" in why(first / "run.json").notes[0]
+
+
+def test_a_unit_whose_code_has_changed_is_not_compared(two: tuple[Toy, Path, Path]) -> None:
+    toy, first, _ = two
+    origin = why(first / next(name for name in package.load(first).summary.files))
+    stage = origin.units[0].use
+    toy.edit("plug.py", lambda text: text.replace(f'@stage("{stage}")', f'@stage("{stage}", version=7)'))
+    with pytest.raises(UsageError, match="cannot be computed again as it was"):
+        repeat(origin)
+
+
+def test_the_commands_print_text_and_json(two: tuple[Toy, Path, Path], pano_mvs: Command, tmp_path: Path) -> None:
+    toy, first, second = two
+    listed = pano_mvs("runs", toy.folder / "runs", "--csv", tmp_path / "runs.csv")
+    assert listed.code == 0, listed.text
+    assert "scaled.by" in listed.flat
+    assert (tmp_path / "runs.csv").read_text().count("\n") == 3
+    assert len(json.loads(pano_mvs("runs", toy.folder / "runs", "--json").text)["runs"]) == 2
+    page = tmp_path / "page.html"
+    compared = pano_mvs("diff", first, second, "--page", page)
+    assert "scaled.by: 3 → 4" in compared.flat
+    assert "scaled.by: 3 → 4" in page.read_text(encoding="utf-8")
+    assert json.loads(pano_mvs("diff", first, second, "--json").text)["settings"][0]["name"] == "scaled.by"
+    name = next(name for name in package.load(first).summary.files)
+    again = pano_mvs("why", first / name, "--again")
+    assert again.code == 0
+    assert "the same bytes" in again.flat
+    assert json.loads(pano_mvs("why", first / name, "--json").text)["units"][0]["depth"] == 0
+    assert pano_mvs("diff", first, toy.folder / "nowhere").code == 2
+
+
+def test_ranges_are_compared_by_class_and_by_solid_angle() -> None:
+    before = np.full((8, 16), 2.0, np.float32)
+    after = before.copy()
+    after[:, :4] *= 1.05
+    after[:, 4:6] = np.nan
+    before[:, 6:7] = np.nan
+    confidence = np.full((8, 16), 200, np.uint8)
+    confidence[:, :2] = 30
+    confidence[:, 4:6] = 0
+    found = compare_ranges("a.png", before, after, confidence=confidence)
+    assert found.changed == pytest.approx(4 / 13)
+    assert found.only_before == pytest.approx(2 / 16)
+    assert found.only_after == pytest.approx(1 / 16)
+    assert found.by_class == pytest.approx({"confirmed": 2 / 11, "filled": 1.0})
+    assert found.median == 0
+    assert not found.size_differs
+    small = compare_ranges("a.png", before, after[::2, ::2], confidence=confidence[::2, ::2])
+    assert small.size_differs
+    assert "differ by more than 1 %" in str(small)
+
+
+@pytest.mark.slow
+def test_two_real_runs_are_compared_with_poses_and_ranges(rendered: Path, tmp_path: Path) -> None:
+    for name, planes in (("first", 32), ("second", 48)):
+        package.run(
+            "quickstart",
+            images=rendered / "images",
+            out=tmp_path / name,
+            settings={"depth.planes": planes, "features.max_keypoints": 1500, "scores.truth": rendered / "truth"},
+            cache=tmp_path / "cache",
+        )
+    found = diff(tmp_path / "first", tmp_path / "second")
+    assert [change.name for change in found.settings] == ["depth.planes"]
+    assert isinstance(found.poses, PoseChanges)
+    assert len(found.poses.cameras) == 4
+    assert not found.poses.moved
+    assert len(found.ranges) == 4
+    assert {*found.ranges[0].by_class} <= {"confirmed", "seen", "filled"}
+    assert found.reasons["depth"].startswith("setting planes")
+    assert set(found.reasons) >= {"depth", "checked", "cloud", "ranges"}
+    assert not {"images", "features", "poses"} & set(found.reasons)
+    page = diff_page(found)
+    assert page.count("<figure>") == 4
+    assert page.count("data:image/jpeg") == 12
+    table = runs([tmp_path])
+    assert table.settings == ("depth.planes",)
+    assert "scores.median_pair_error_deg" in table.metrics
+    for name in ("cloud.ply", "range/000.tiff", "colmap/sparse/0/images.bin", "preview/000.jpg"):
+        origin = why(tmp_path / "first" / name)
+        assert {unit.use for unit in origin.units} >= {"source.folder"}, name
+        assert len(origin.images) == 4
