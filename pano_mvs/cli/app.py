@@ -276,6 +276,21 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
     Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
 
 
+@app.command("fmt")
+@guarded
+def format_files(
+    files: Annotated[list[Path], typer.Argument(metavar="WORKFLOW...", help="Workflow files.")],
+    check_only: Annotated[
+        bool, typer.Option("--check", help="Change no file; exit code 4 if one is not laid out.")
+    ] = False,
+    show_diff: Annotated[bool, typer.Option("--diff", help="Print what would change, and change no file.")] = False,
+) -> None:
+    """Lay out workflow files: order of keys, one line for a stage where it fits, no needless quotes, all comments."""
+    from pano_mvs.cli.format_command import format_workflows
+
+    raise typer.Exit(format_workflows(files, Console(), check=check_only, show=show_diff))
+
+
 @app.command()
 @guarded
 def schema(

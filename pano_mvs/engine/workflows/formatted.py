@@ -1,0 +1,201 @@
+"""Lay out a workflow file: the order of keys, one line for a stage where it fits, no needless quotes, all comments.
+
+Comments stay before the key that they precede, or behind the entry that they follow. An entry with comments inside, or
+with anchors, aliases or tags, stays as it is written.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from ruamel.yaml import YAML
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from pano_mvs.core.errors import WorkflowError
+from pano_mvs.core.yaml_text import parse_yaml
+from pano_mvs.engine.workflows.policy import RESERVED_KEYS
+
+WIDTH = 120
+_TOP = ("pano_mvs", "name", "extends", "plugins", "stages")
+_MOST_PADDED = 8  # names up to this length, and up to the median one, have their values in one column
+_NOT_PLAIN = re.compile(r"[,\[\]{}#&*!|>'\"%@`]|^[-?:]|: |:$|^\s|\s$|^$|[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_SHARED = re.compile(r"(^|[\s\[{,])[&*!][\w<]")  # an anchor, an alias or a tag
+
+
+@dataclass
+class _Entry:
+    """A key of a mapping with its value, and the comments that belong to it."""
+
+    key: str
+    node: Node
+    lines: list[str]  # as written, without the comments before it
+    before: list[str] = field(default_factory=list)  # comment and empty lines before it, without indentation
+    behind: str = ""  # the comment behind its last line
+
+
+def formatted(text: str, shown_as: str) -> str:
+    """Return a workflow file in the usual layout; it means the same.
+
+    Args:
+        text: YAML 1.2.
+        shown_as: name of the file in messages.
+
+    Raises:
+        WorkflowError: if it is not a mapping in YAML.
+    """
+    value = parse_yaml(text, shown_as)
+    root = YAML(typ="rt", pure=True).compose(text)
+    if not isinstance(value.value, dict) or not isinstance(root, MappingNode):
+        raise WorkflowError([f"{shown_as}: a workflow is a mapping with the key stages"])
+    lines = text.splitlines()
+    if root.flow_style or _SHARED.search(lines[0] if lines else ""):
+        return text  # one flow mapping, as a program writes it
+    entries, rest = _entries(root, lines, end=len(lines))
+    entries.sort(key=lambda entry: _TOP.index(entry.key) if entry.key in _TOP else len(_TOP))
+    found: list[str] = []
+    for entry in entries:
+        found += entry.before
+        found += _stages(entry, lines) if entry.key == "stages" else _top(entry)
+    made = "\n".join([*found, *rest]).rstrip("\n") + "\n"
+    if parse_yaml(made, shown_as).plain() != value.plain():
+        raise WorkflowError([f"{shown_as}: cannot be laid out without changing what it means; it was left as it is"])
+    return made
+
+
+def _entries(node: MappingNode, lines: list[str], *, end: int) -> tuple[list[_Entry], list[str]]:
+    """Return the entries of a mapping in block style, and the comments behind the last one.
+
+    Args:
+        end: the line behind the mapping.
+    """
+    keys = [(str(key.value), key.start_mark.line, value) for key, value in node.value]
+    found: list[_Entry] = []
+    before = [line.strip() for line in lines[: keys[0][1]] if line.strip().startswith("#")] if _is_root(node) else []
+    for (key, start, value), following in zip(keys, [*(line for _, line, _ in keys[1:]), end], strict=True):
+        own = lines[start:following]
+        after: list[str] = []
+        column = int(node.value[0][0].start_mark.column)
+        while own and (not own[-1].strip() or (own[-1].lstrip().startswith("#") and _indentation(own[-1]) <= column)):
+            after.insert(0, own.pop().strip())
+        found.append(_Entry(key, value, own, before=before, behind=_comment_behind(own[-1]) if own else ""))
+        before = after
+    return found, before
+
+
+def _indentation(line: str) -> int:
+    return len(line) - len(line.lstrip())
+
+
+def _is_root(node: MappingNode) -> bool:
+    return int(node.start_mark.column) == 0
+
+
+def _top(entry: _Entry) -> Iterator[str]:
+    """Yield the lines of a key of the file other than `stages`."""
+    line = f"{entry.key}: {_flow(entry.node)}" + (f"  {entry.behind}" if entry.behind else "")
+    if _is_plain(entry) and len(line) <= WIDTH and not isinstance(entry.node, MappingNode):
+        yield line
+    else:
+        yield from _written(entry, indent="")
+
+
+def _stages(entry: _Entry, lines: list[str]) -> Iterator[str]:
+    """Yield the lines of the stages, one line each where it fits."""
+    node = entry.node
+    if not isinstance(node, MappingNode) or node.flow_style or not node.value:
+        yield from _written(entry, indent="")
+        return
+    first = node.value[0][0].start_mark.line
+    head = [line.strip() for line in lines[node_line(entry, lines) + 1 : first]]
+    last = node_line(entry, lines) + len(entry.lines)
+    found, rest = _entries(node, lines, end=last)
+    lengths = sorted(len(one.key) for one in found)
+    most = max(_MOST_PADDED, lengths[len(lengths) // 2])
+    padded = max((length for length in lengths if length <= most), default=0) + 2
+    yield "stages:" + (f"  {behind}" if (behind := _comment_behind(entry.lines[0])) else "")
+    for line in head:
+        yield f"  {line}".rstrip()
+    for stage in found:
+        for line in stage.before:
+            yield f"  {line}".rstrip()
+        yield from _stage(stage, padded)
+    for line in rest:
+        yield f"  {line}".rstrip()
+
+
+def node_line(entry: _Entry, lines: list[str]) -> int:
+    """Return the line of an entry's key."""
+    return lines.index(entry.lines[0])
+
+
+def _stage(entry: _Entry, padded: int) -> Iterator[str]:
+    if not isinstance(entry.node, MappingNode) or not _is_plain(entry):
+        yield from _written(entry, indent="  ")
+        return
+    pairs = [(str(key.value), value) for key, value in entry.node.value]
+    pairs.sort(key=lambda pair: 0 if pair[0] == "use" else 2 if pair[0] in RESERVED_KEYS else 1)
+    behind = f"  {entry.behind}" if entry.behind else ""
+    text = ", ".join(f"{_scalar(key)}: {_flow(value)}" for key, value in pairs)
+    line = f"  {f'{entry.key}:'.ljust(max(padded, len(entry.key) + 2))}{{{text}}}{behind}"
+    if len(line) <= WIDTH:
+        yield line
+        return
+    yield f"  {entry.key}:{behind}"
+    for key, value in pairs:
+        yield f"    {_scalar(key)}: {_flow(value)}"
+
+
+def _written(entry: _Entry, *, indent: str) -> Iterator[str]:
+    """Yield the lines of an entry as they are, moved to an indentation."""
+    old = _indentation(entry.lines[0])
+    for line in entry.lines:
+        yield f"{indent}{line[old:]}".rstrip() if not line[:old].strip() else line.rstrip()
+
+
+def _is_plain(entry: _Entry) -> bool:
+    """Return whether an entry can be written anew: no comments inside, no anchors, aliases, tags or long texts."""
+    inner = entry.lines[:-1] if entry.behind else entry.lines
+    if any(_comment_behind(line) or line.lstrip().startswith("#") for line in inner):
+        return False
+    return not any(_SHARED.search(line) for line in entry.lines) and not _has_long_text(entry.node)
+
+
+def _has_long_text(node: Node) -> bool:
+    if isinstance(node, ScalarNode):
+        return node.style in ("|", ">")
+    parts = [part for pair in node.value for part in pair] if isinstance(node, MappingNode) else node.value
+    return any(_has_long_text(part) for part in parts)
+
+
+def _flow(node: Node) -> str:
+    if isinstance(node, MappingNode):
+        return "{" + ", ".join(f"{_scalar(str(key.value))}: {_flow(value)}" for key, value in node.value) + "}"
+    if isinstance(node, SequenceNode):
+        return "[" + ", ".join(map(_flow, node.value)) + "]"
+    assert isinstance(node, ScalarNode)
+    text = str(node.value)
+    if node.style in ("'", '"'):
+        return _scalar(text)
+    return text if text else "null"
+
+
+def _scalar(text: str) -> str:
+    """Return a text as YAML, without quotes if it needs none."""
+    plain = not _NOT_PLAIN.search(text) and parse_yaml(f"[{text}]", "").plain() == [text]
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def _comment_behind(line: str) -> str:
+    """Return the comment at the end of a line, which begins with `#` after a blank outside of quotes; "" if none."""
+    quote = ""
+    for place, sign in enumerate(line):
+        if quote:
+            quote = "" if sign == quote and not (quote == '"' and line[place - 1] == "\\") else quote
+        elif sign in "'\"" and (not place or line[place - 1] in " \t[{,:"):
+            quote = sign
+        elif sign == "#" and place and line[place - 1] in " \t":
+            return line[place:].rstrip()
+    return ""
