@@ -36,7 +36,7 @@ def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, sh
         elif not check:
             write_given(path, made, str(path))
     for path in changed:
-        console.say(f"{escape(str(path))}: {'would be' if check or show else 'was'} laid out anew")
+        console.say(f"{escape(str(path))}: {'is not laid out as usual' if check or show else 'was laid out'}")
     if not changed:
         console.say(f"{len(paths)} laid out as usual already" if len(paths) > 1 else "laid out as usual already")
     return 4 if changed and (check or show) else 0

@@ -156,7 +156,7 @@ def _written(entry: _Entry, *, indent: str) -> Iterator[str]:
 
 
 def _is_plain(entry: _Entry) -> bool:
-    """Return whether an entry can be written anew: no comments inside, no anchors, aliases, tags or long texts."""
+    """Return whether an entry can be written again: no comments inside, no anchors, aliases, tags or long texts."""
     inner = entry.lines[:-1] if entry.behind else entry.lines
     if any(_comment_behind(line) or line.lstrip().startswith("#") for line in inner):
         return False

@@ -138,7 +138,7 @@ def test_the_command_writes_checks_and_shows(pano_mvs: Command, tmp_path: Path) 
     assert shown.code == 4
     assert "+  ply:    {use: export.ply}  # last" in shown.text
     assert path.read_text() == MESSY
-    assert "was laid out anew" in pano_mvs("fmt", path).flat
+    assert "was laid out" in pano_mvs("fmt", path).flat
     assert path.read_text() == NEAT
     assert pano_mvs("fmt", path, "--check").code == 0
     assert pano_mvs("fmt", tmp_path / "nowhere.yaml").code == 2
