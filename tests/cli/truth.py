@@ -18,11 +18,11 @@ from pano_mvs.io.truth import Truth, read_truth
 
 @dataclass(frozen=True)
 class RangeErrors:
-    """Errors of one range map; means over the pixels with truth by solid angle, where a missing range counts as 0."""
+    """Errors of one range map at the pixels with truth, where a missing range counts as 0."""
 
-    psnr_db: float  # of ranges of 10 units
-    mae: float
-    near: float  # the share within a ratio of 1.05
+    psnr_db: float  # over the pixels, of a peak of 10 units
+    mae: float  # by solid angle
+    near: float  # the share of the solid angle with errors within a ratio of 1.05
     completeness: float  # the share of pixels that have a range
     median: float  # of the relative errors of those
 
@@ -73,7 +73,7 @@ def _errors(estimated: FloatArray, truth: NDArray[np.float32]) -> RangeErrors:
     with np.errstate(invalid="ignore"):
         near = np.maximum(found, true) < 1.05 * np.minimum(found, true)
     return RangeErrors(
-        psnr_db=float(-10 * np.log10(np.average((error / 10) ** 2, weights=weight))),
+        psnr_db=float(-10 * np.log10(np.mean((error / 10) ** 2))),
         mae=float(np.average(error, weights=weight)),
         near=float(np.average(near, weights=weight)),
         completeness=float(has.mean()),
