@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
-from pano_mvs.scene import PointCloud, Poses, RangeMap
-from pano_mvs.scene.upright import WorldAxes, z_up_from_world
+from pano_mvs.scene import PointCloud, Poses, RangeMap, WorldAxes
+from pano_mvs.scene.upright import z_up_from_world
 
 WORLD_FROM_Z_UP = z_up_from_world().T
 
