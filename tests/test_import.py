@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,25 @@ def test_all_names_are_there_and_type_checkers_see_the_same() -> None:
         assert getattr(pano_mvs, name) is not None
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         pano_mvs.nothing  # noqa: B018  # the attribute is asked for
+
+
+def test_tests_of_the_core_import_no_plugin() -> None:
+    """They pass where the folder plugins was deleted; those in docs and tools are about the whole distribution."""
+    tests = Path(__file__).parent
+    helpers = {path.stem for path in tests.parent.glob("plugins/*/tests/*.py")}
+    found = {}
+    for path in sorted(tests.rglob("*.py")):
+        if path.relative_to(tests).parts[0] not in ("docs", "tools"):
+            packages = {module.partition(".")[0] for module in imported_modules(path.read_text(encoding="utf-8"))}
+            found[path] = {name for name in packages if name.startswith("pano_mvs_") or name in helpers}
+    assert len(found) > 200
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def imported_modules(text: str) -> Iterator[str]:
+    """Yield the modules that a module imports from elsewhere, also within its functions."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.module or ""
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)

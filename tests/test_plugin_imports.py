@@ -1,10 +1,9 @@
-"""Plugins that we ship, and those that `plugin new` writes, import public modules alone: stages the API for plugins."""
+"""Plugins that `plugin new` writes import public modules alone: stages the API for plugins."""
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -12,9 +11,9 @@ from pano_mvs import api
 from pano_mvs.api import sweep
 from pano_mvs.cli.plugins.new import KINDS, rendered
 
-PLUGINS = Path(__file__).parents[1] / "plugins"
-FILES = sorted([*PLUGINS.glob("pano_mvs_*/pano_mvs_*/**/*.py"), *PLUGINS.glob("examples/*.py")])
 ALLOWED = {"pano_mvs.api", "pano_mvs.api.sweep"}
+
+
 # What plugins beside stages may import as well; docs/plugins.md lists these.
 PUBLIC = {
     "pano_mvs",
@@ -44,16 +43,6 @@ def imported(text: str) -> Iterator[str]:
         yield from (name for name in names if name.split(".")[0] == "pano_mvs")
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_shipped_plugins_import_the_api_alone(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert set(imported(text)) <= ALLOWED
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.ImportFrom) and node.module in ALLOWED:
-            module = sweep if node.module.endswith("sweep") else api
-            assert {alias.name for alias in node.names} <= set(module.__all__)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_new_plugins_import_public_modules_alone(kind: str) -> None:
     plugin, test = rendered(kind, "mine")
@@ -63,8 +52,7 @@ def test_new_plugins_import_public_modules_alone(kind: str) -> None:
     assert set(imported(test)) == {"pano_mvs.testing.conformance"}
 
 
-def test_there_are_plugins_and_other_imports_are_seen() -> None:
-    assert {path.parent.name for path in FILES} >= {"examples", "pano_mvs_example", "pano_mvs_las", "pano_mvs_torch"}
+def test_other_imports_are_seen() -> None:
     assert list(imported("import pano_mvs.io\nfrom pano_mvs.scene import Poses\nimport pano_mvs_las")) == [
         "pano_mvs.io",
         "pano_mvs.scene",

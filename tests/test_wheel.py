@@ -85,7 +85,7 @@ def test_the_source_distribution_builds_the_same_wheel(tmp_path: Path, names: se
     there = below(root / "tests", "*") | below(root / "tools", "*") | below(root / "docs", "*.md")
     assert set(needed) == there, "its tests could not run"
     read_by_tests = {"README.md", "CHANGELOG.md", "CITATION.cff", "SECURITY.md", "Dockerfile", ".dockerignore"}
-    read_by_tests |= {"pyproject.toml", ".ci", ".github", "plugins"}
+    read_by_tests |= {"pyproject.toml", ".ci", ".github"}
     assert read_by_tests <= {path.name for path in root.iterdir()}
 
 

@@ -1,4 +1,7 @@
-"""The commands of the command line, those of plugins among them."""
+"""The commands of the command line, those of plugins among them.
+
+`python -m tests.cli.command_tree` starts the help of each.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 
@@ -22,3 +26,15 @@ def _below(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[tuple
         child = command.get_command(context, name)
         inner = child.make_context(name, [], parent=context, resilient_parsing=True)
         yield from _below(child, inner, (*words, name))
+
+
+def main() -> None:
+    """Start the help of each command; a command of a plugin that cannot be loaded says so in its help."""
+    for words, _ in all_commands():
+        result = CliRunner().invoke(app, [*words, "--help"])
+        assert result.exit_code == 0, result.output
+        assert "cannot be used" not in result.output, result.output
+
+
+if __name__ == "__main__":
+    main()

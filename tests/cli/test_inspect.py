@@ -19,9 +19,24 @@ from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Outcome
 from tests.synthetic.capture_files import write_capture
 
+# Any stage with a setting `truth` says where the truth is.
+PLUGIN = '''\
+from pano_mvs.api import All, InputPath, Params, RangeMap, Scores, stage
+
+
+class TruthParams(Params):
+    truth: InputPath
+
+
+@stage("scores.none")
+def none(ranges: All[RangeMap], params: TruthParams) -> Scores:
+    """Compare nothing."""
+    return Scores({}, {})
+'''
 WORKFLOW = """\
 pano_mvs: 1
 name: tuned
+plugins: [scores.py]
 stages:
   images:  {use: source.folder, path: capture/images, nadir_deg: 20}
   poses:   {use: poses.from_model, path: halved.json}
@@ -29,7 +44,7 @@ stages:
   depth:   {use: depth.sweep, planes: 24, near: 0.3, far: 4}
   boxed:   {use: depth.sweep, planes: 24, aggregation: box}
   checked: {use: filters.consistency, in: {range_map: depth, sources: depth}}
-  scores:  {use: evaluate.truth, truth: capture/truth, in: {ranges: checked}}
+  scores:  {use: scores.none, truth: capture/truth, in: {ranges: checked}}
 """
 SIZE_HW = (64, 128)
 
@@ -50,6 +65,7 @@ def inspected(*arguments: object) -> dict[str, Any]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inspected")
     write_capture(folder / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=SIZE_HW)
+    (folder / "scores.py").write_text(PLUGIN)
     (folder / "wf.yaml").write_text(WORKFLOW)
     poses = json.loads((folder / "capture" / "truth" / "poses.json").read_text())
     for view in poses["views"]:  # scene units of two metres
@@ -115,7 +131,7 @@ def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Pat
 
 
 def test_a_run_in_which_an_image_failed_can_be_inspected(run: Path, tmp_path: Path) -> None:
-    for name in ("wf.yaml", "halved.json"):
+    for name in ("wf.yaml", "scores.py", "halved.json"):
         shutil.copy(run / name, tmp_path)
     shutil.copytree(run / "capture", tmp_path / "capture")
     whole = (tmp_path / "capture" / "images" / "000.png").read_bytes()
@@ -246,6 +262,11 @@ def test_the_pictures_of_the_run_are_found_from_anywhere(
 
 
 def test_a_workflow_without_a_sweep_is_told(tmp_path: Path, run: Path) -> None:
-    text = WORKFLOW.replace("capture/", f"{run}/capture/").replace("halved", f"{run}/halved").split("  depth:")[0]
+    text = (
+        WORKFLOW.replace("capture/", f"{run}/capture/")
+        .replace("halved", f"{run}/halved")
+        .replace("scores.py", f"{run}/scores.py")
+        .split("  depth:")[0]
+    )
     (tmp_path / "none.yaml").write_text(text)
     assert "no depth.sweep" in call("inspect", tmp_path / "none.yaml", "000.png", 1, 1).flat

@@ -17,10 +17,11 @@ from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.unit_keys import _static_identity
 from pano_mvs.engine.workflows.resolved import resolved_yaml
-from pano_mvs.session.session import Session, open_session, presets_folder
+from pano_mvs.session.session import Session, open_session
 from tests.cli.conftest import Command
 from tests.engine.conftest import Toy
 from tests.engine.toy import HELPER, PLUGIN
+from tests.presets import usable_presets
 
 
 @pytest.fixture
@@ -177,7 +178,7 @@ def test_plan_takes_the_out_of_a_run_and_writes_nothing_there(toy: Toy) -> None:
     assert "reads this folder" in " ".join(refused.output.split())
 
 
-PRESETS = sorted(path.stem for path in presets_folder().glob("*.yaml"))
+PRESETS = [path.stem for path in usable_presets()]
 
 
 def resolved_session(session: Session, folder: Path, name: str = "all.yaml") -> Session:
@@ -337,7 +338,7 @@ def test_of_a_workflow_that_is_being_written(pano_mvs: Command) -> None:
     result = pano_mvs("schema", "mine.yaml")
     assert result.code == 0, result.text
     schema = json.loads(result.text)
-    assert "toy.scale" in schema["$defs"]["stage"]["properties"]["use"]["enum"]
+    assert "toy.scale" in schema["$defs"]["stage"]["else"]["properties"]["use"]["enum"]
     assert "depth" in schema["properties"]["stages"]["properties"]
 
 

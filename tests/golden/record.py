@@ -1,4 +1,4 @@
-"""Call each built-in stage on the tiny capture, and compare what it makes with what is written down."""
+"""Call each stage of ours on the tiny capture, and compare what it makes with what is written down."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
@@ -130,10 +131,10 @@ class Golden:
 
 
 def case_names() -> list[str]:
-    """Return the names of all cases: the built-in stages, and some with other settings."""
+    """Return the names of all cases: the stages of the core and of the bundled plugins, some with other settings."""
     stages = Registry.installed().stages
-    builtin = [name for name in stages if stages[name].function.__module__.startswith("pano_mvs.stages.")]
-    return sorted([*builtin, *MORE_CASES])
+    ours = [name for name in stages if stages[name].function.__module__.partition(".")[0] in own_packages()]
+    return sorted([*ours, *MORE_CASES])
 
 
 def made_now(name: str) -> Golden:

@@ -34,7 +34,8 @@ def test_no_result_changes_under_a_key_that_stays(name: str) -> None:
 
 
 def test_every_stage_is_written_down() -> None:
-    assert set(read_recorded()) == {*case_names()}
+    """That each one which is written down still exists is tested where the bundled plugins are."""
+    assert {*case_names()} <= set(read_recorded())
 
 
 def test_a_result_that_changes_under_its_key_is_a_complaint() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_floor_plan_stage import the_cloud, the_poses
 
 import pano_mvs
 from pano_mvs.api import Context, InputError, PointCloud, Poses, UsageError
@@ -36,7 +35,7 @@ from pano_mvs.stages.frame import ScaleParams, scale
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.io.test_ply import vertices
-from tests.synthetic.floor_plan_rooms import room_cloud
+from tests.synthetic.floor_plan_rooms import room_cloud, the_cloud, the_poses
 
 WORKFLOW = """
 pano_mvs: 1

@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
-from pano_mvs_evaluation.stages import TruthParams, truth
-from pano_mvs_splats.nerfstudio import NerfstudioParams, nerfstudio
-from pano_mvs_splats.splat_bundle import SplatBundleParams, splat_bundle
 
-from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Names
-from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.ply import read_ply
-from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, SplatFrames
-from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
+from pano_mvs.scene import PointCloud, Pose, Poses
 from pano_mvs.scene.files import FaceFiles
-from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
-from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
+from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.scene.surfaces import TrackedPoints
 from pano_mvs.stages.depth import PatchMatchParams, SweepParams, exchange, patchmatch, sweep
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
@@ -42,50 +34,12 @@ from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import tracked, vote
 from pano_mvs.stages.poses import known_groups, known_poses
-from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
-from tests.stored import write_npz
+from pano_mvs.testing.tiny_capture import tiny_capture
+from tests.synthetic.two_rooms import LARGE, ORDER, SMALL, FusionParams, Rooms, context, fused, placed
 
-FusionParams = Registry.installed().stages["fusion.vote"].params_type
 TrackedParams = Registry.installed().stages["points.tracked"].params_type
 LevelParams = Registry.installed().stages["poses.level"].params_type
 ExchangeParams = Registry.installed().stages["depth.exchange"].params_type
-
-_LARGE = ("000.png", "001.png", "003.png")
-# The smaller room is the same capture's, under other names, in a world that is turned, moved and half as large.
-_SMALL = {"b0.png": "000.png", "b1.png": "002.png"}
-_ORDER = ("b0.png", "000.png", "001.png", "b1.png", "003.png")
-_MOVED = Similarity3(0.5, rotation_from_rotvec([0.1, 1.0, -0.2]), np.array([3.0, 1.0, -2.0]))
-
-
-Item = TypeVar("Item")
-
-
-class Rooms:
-    """The values that stages take, of both rooms."""
-
-    def __init__(self, tiny: TinyCapture) -> None:
-        whole = tiny.whole(Poses)
-        large, small = (_with(whole, names) for names in (_LARGE, tuple(_SMALL.values())))
-        small = replace(moved_poses(small, _MOVED), names=tuple(_SMALL), frame="the small room's", scale="its own")
-        self.poses = join_groups([small, large], order=_ORDER)
-        self.images = self._of(tiny.each(Panorama))
-        self.ranges = self._of(tiny.each(RangeMap))
-        self.samples = self._of(tiny.each(SurfaceSamples))
-        for name in _SMALL:
-            own = self.ranges[name]
-            self.ranges[name] = replace(own, range=(0.5 * own.range).astype(np.float32))
-            self.samples[name] = replace(
-                self.samples[name], ranges=(0.5 * self.samples[name].ranges).astype(np.float32)
-            )
-        self.pose_items: Mapping[str, Pose] = self.poses.explode()
-
-    @staticmethod
-    def _of(items: Mapping[str, Item]) -> dict[str, Item]:
-        return {name: items[_SMALL.get(name, name)] for name in _ORDER}
-
-
-def _with(poses: Poses, names: tuple[str, ...]) -> Poses:
-    return with_cameras(poses, np.array([name in names for name in poses.names]))
 
 
 @pytest.fixture(scope="module")
@@ -95,28 +49,11 @@ def rooms() -> Rooms:
 
 @pytest.fixture
 def ctx(tmp_path: Path) -> Context:
-    return _context(tmp_path / "stage")
-
-
-def _context(folder: Path) -> Context:
-    folder.mkdir()
-    return Context(np.random.default_rng(0), folder)
-
-
-def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> PointCloud:
-    chosen = {name: rooms.ranges[name] for name in names}
-    poses = {name: Pose(rooms.pose_items[name].cam_from_world, rooms.pose_items[name].group) for name in names}
-    if set(names) == set(_SMALL):
-        poses = {name: Pose(pose.cam_from_world) for name, pose in poses.items()}
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        ctx = Context(np.random.default_rng(0), Path(folder))
-        return vote(ranges=chosen, poses=poses, images=rooms.images, params=FusionParams(**settings), ctx=ctx)
+    return context(tmp_path / "stage")
 
 
 def test_each_image_knows_its_group(rooms: Rooms) -> None:
-    assert {name: pose.group for name, pose in rooms.pose_items.items()} == {
-        name: int(name in _SMALL) for name in _ORDER
-    }
+    assert {name: pose.group for name, pose in rooms.pose_items.items()} == {name: int(name in SMALL) for name in ORDER}
     pose = rooms.pose_items["b1.png"]
     assert Pose.from_parts(pose.to_parts()).group == 1
     meta = rooms.pose_items["000.png"].to_parts()["meta"]
@@ -125,11 +62,11 @@ def test_each_image_knows_its_group(rooms: Rooms) -> None:
 
 
 def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None:
-    cloud = _fused(rooms, min_views=3)
+    cloud = fused(rooms, min_views=3)
     cloud.check()
     assert PointCloud.from_parts(cloud.to_parts()).group_sizes == cloud.group_sizes
-    for group, names in zip(cloud.groups(), (_LARGE, tuple(_SMALL)), strict=True):
-        alone = _fused(rooms, names, min_views=3)
+    for group, names in zip(cloud.groups(), (LARGE, tuple(SMALL)), strict=True):
+        alone = fused(rooms, names, min_views=3)
         assert len(alone) > 100
         assert alone.group_sizes == ()
         np.testing.assert_array_equal(group.points_in_world, alone.points_in_world)
@@ -138,14 +75,14 @@ def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None
 
 
 def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> None:
-    ranges = {name: rooms.ranges[name] for name in _LARGE}
+    ranges = {name: rooms.ranges[name] for name in LARGE}
     cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=FusionParams(), ctx=ctx)
     assert [len(group) > 0 for group in cloud.groups()] == [True, False]
     assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
 
 
 def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: Context) -> None:
-    large = _fused(rooms).groups()[0]
+    large = fused(rooms).groups()[0]
     shorter: dict[str, Any] = {name: value[:5] for name, value in vars(large).items() if isinstance(value, np.ndarray)}
     few = replace(large, **shorter)
     files = mesh(
@@ -153,13 +90,6 @@ def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: C
     ).files
     assert list(files) == ["mesh.ply"]
     assert ctx.notes[0].startswith("no mesh_1.ply: 5 of 5 points are left")
-
-
-def _placed(files: Files, folder: Path) -> Path:
-    for target, path in files.files.items():
-        (folder / target).parent.mkdir(parents=True, exist_ok=True)
-        (folder / target).write_bytes(path.read_bytes())
-    return folder
 
 
 def _model_images(folder: Path) -> dict[str, np.ndarray]:
@@ -170,17 +100,17 @@ def _model_images(folder: Path) -> dict[str, np.ndarray]:
 def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     rooms: Rooms, ctx: Context, tmp_path: Path
 ) -> None:
-    out = _placed(
+    out = placed(
         colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx),
         tmp_path / "out",
     )
-    known = known_poses(out, (*_ORDER, "new.png"))
-    assert set(known.names) == set(_LARGE)
+    known = known_poses(out, (*ORDER, "new.png"))
+    assert set(known.names) == set(LARGE)
     assert known.rejected["b0.png"].startswith("out has it in another group, which has a different frame")
     assert known.rejected["new.png"] == "out has no pose for it"
-    assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
-    both = known_groups(out, (*_ORDER, "new.png"), [])
-    assert [set(group.names) for group in split_groups(both)] == [set(_LARGE), set(_SMALL)]
+    assert known_poses(out / "colmap" / "sparse" / "1", ORDER).names == tuple(SMALL)
+    both = known_groups(out, (*ORDER, "new.png"), [])
+    assert [set(group.names) for group in split_groups(both)] == [set(LARGE), set(SMALL)]
     assert both.rejected == {"new.png": "out has no pose for it"}
 
 
@@ -213,7 +143,7 @@ def _tracked(rooms: Rooms, ctx: Context, count: int = 100) -> TrackedPoints:
 def test_tracked_points_are_seen_from_one_room_each(rooms: Rooms, ctx: Context) -> None:
     points = _tracked(rooms, ctx)
     points.check()
-    in_small = np.array([name in _SMALL for name in points.names])[points.track_image_idx]
+    in_small = np.array([name in SMALL for name in points.names])[points.track_image_idx]
     share = np.bincount(points.track_point_idx, in_small) / np.bincount(points.track_point_idx)
     assert set(share) == {0.0, 1.0}
     assert 10 < share.sum() < len(points) - 10
@@ -240,102 +170,27 @@ def drawn_room(rooms: Rooms) -> Poses:
 
 
 def test_splats_begin_with_a_model_of_each_room(rooms: Rooms, tmp_path: Path) -> None:
-    points = _tracked(rooms, _context(tmp_path / "points"))
-    ctx = _context(tmp_path / "init")
+    points = _tracked(rooms, context(tmp_path / "points"))
+    ctx = context(tmp_path / "init")
     files = colmap_dense_init(
         poses=rooms.poses, points=points, images=rooms.images, params=DenseInitParams(keep_sfm=False), ctx=ctx
     )
-    out = _placed(files, tmp_path)
+    out = placed(files, tmp_path)
     sizes = [pycolmap.Reconstruction(out / f"colmap_dense_init/sparse/{number}").num_points3D() for number in range(2)]
     assert sum(sizes) == len(points)
     assert min(sizes) > 10
 
 
 def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    faces = {name: FaceFiles({}, size_px=12) for name in _ORDER}
+    faces = {name: FaceFiles({}, size_px=12) for name in ORDER}
     files = colmap_dense(
-        poses=rooms.poses, faces=faces, images=Names(_ORDER), points=None, params=DenseParams(format="bin"), ctx=ctx
+        poses=rooms.poses, faces=faces, images=Names(ORDER), points=None, params=DenseParams(format="bin"), ctx=ctx
     )
-    out = _placed(files, tmp_path) / "colmap_dense"
-    for folder, names in (("sparse", _LARGE), ("sparse/0", _LARGE), ("sparse/1", _SMALL)):
+    out = placed(files, tmp_path) / "colmap_dense"
+    for folder, names in (("sparse", LARGE), ("sparse/0", LARGE), ("sparse/1", SMALL)):
         assert {name.rpartition("_")[0] for name in _model_images(out / folder)} == {Path(name).stem for name in names}
     assert "b0" not in (out / "stereo" / "fusion.cfg").read_text()
     assert any("group 1 (b0.png, b1.png) has its own frame" in note for note in ctx.notes)
-
-
-_FRAME = NerfstudioFrame(
-    "equirectangular",
-    "images/{name}",
-    "",
-    "",
-    (64, 32),
-    (32.0, 32.0),
-    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-)
-
-
-def test_each_room_of_a_splat_bundle_has_its_own_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    frames = {name: SplatFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
-    files = splat_bundle(
-        frames=frames,
-        poses=rooms.poses,
-        cloud=_fused(rooms),
-        points=None,
-        photographs=None,
-        params=SplatBundleParams(),
-        ctx=ctx,
-    )
-    out = _placed(files, tmp_path) / "splat_bundle"
-    manifest = json.loads((out / "manifest.json").read_text())
-    for number, names in enumerate((_LARGE, tuple(_SMALL))):
-        about = manifest["groups"][number]
-        assert about["world"] == rooms.poses.worlds[number].frame
-        model = pycolmap.Reconstruction(str(out / about["variants"]["equirectangular"]["colmap"]))
-        assert {image.name for image in model.images.values()} == set(names)
-        assert len(model.points3D) > 20
-        listed = json.loads((out / about["variants"]["equirectangular"]["transforms"]).read_text())
-        assert {entry["panorama"] for entry in listed["frames"]} == set(names)
-        assert {view["panorama"] for view in manifest["views"] if view["group"] == number} == set(names)
-
-
-def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    frames = {name: NerfstudioFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
-    cloud = _fused(rooms)
-    files = nerfstudio(
-        frames=frames, poses=rooms.poses, cloud=cloud, photographs=None, params=NerfstudioParams(), ctx=ctx
-    )
-    out = _placed(files, tmp_path) / "nerfstudio" / "equirectangular"
-    for number, (names, suffix) in enumerate(((_LARGE, ""), (tuple(_SMALL), "_1"))):
-        document = json.loads((out / f"transforms{suffix}.json").read_text())
-        assert {entry["panorama"] for entry in document["frames"]} == set(names)
-        assert document["ply_file_path"] == f"seed{suffix}.ply"
-        assert document["world_frame"] == rooms.poses.worlds[number].frame
-        assert len(read_ply(out / f"seed{suffix}.ply")) == sum(cloud.groups()[number].view_counts >= 2)
-
-
-def test_each_room_is_aligned_with_the_truth_on_its_own(rooms: Rooms, tmp_path: Path) -> None:
-    tiny = tiny_capture()
-    folder = _truth_of_rooms(tiny, tmp_path / "truth")
-    scores = truth(images=rooms.images, poses=rooms.poses, ranges=rooms.ranges, params=TruthParams(truth=folder))
-    assert scores.poses["registered"] == 5
-    assert scores.poses["registered_in_one_frame"] == 3
-    assert scores.poses["scale_ratio_error_max"] < 1e-6
-    assert 0 < scores.poses["auc_1_deg"] == pytest.approx(4 / 10)  # three pairs of the large room, one of the small one
-    assert all(view["median_relative_error"] < 0.01 for view in scores.views.values())
-    assert len(scores.views) == 5
-    assert "in 2 groups" in scores.notes[0]
-
-
-def _truth_of_rooms(tiny: TinyCapture, folder: Path) -> Path:
-    folder.mkdir()
-    of_image = {name: tiny.names.index(_SMALL.get(name, name)) for name in _ORDER}
-    views = [
-        {"image": name, "R": tiny.poses[idx].rotation.tolist(), "t": tiny.poses[idx].translation.tolist()}
-        for name, idx in of_image.items()
-    ]
-    (folder / "poses.json").write_text(json.dumps({"width": 64, "height": 32, "metric": True, "views": views}))
-    write_npz(folder / "depth.npz", {Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
-    return folder
 
 
 def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context) -> None:
@@ -352,7 +207,7 @@ def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context) -> None:
 
 def test_a_camera_that_is_upside_down_unlike_the_others_is_named(rooms: Rooms, ctx: Context) -> None:
     over = np.diag([-1.0, -1.0, 1.0])
-    name, images, poses = _LARGE[-1], dict(rooms.images), split_groups(rooms.poses)[0]
+    name, images, poses = LARGE[-1], dict(rooms.images), split_groups(rooms.poses)[0]
     idx = poses.names.index(name)
     images[name] = replace(images[name], up_in_cam=tuple(over @ images[name].up_in_cam))
     turned = replace(poses, rotations=poses.rotations.copy(), translations=poses.translations.copy())

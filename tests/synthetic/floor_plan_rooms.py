@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, ray_grid
-from pano_mvs.scene import RangeMap
+from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
+from pano_mvs.scene import PointCloud, Poses, RangeMap, WorldAxes
+from pano_mvs.scene.upright import z_up_from_world
+
+WORLD_FROM_Z_UP = z_up_from_world().T
 
 HEIGHT = 2.6
 
@@ -89,6 +92,27 @@ def room_cloud(
     normals = np.concatenate([each for _, each, _ in parts])
     colors = np.concatenate([np.tile(np.array(color, np.uint8), (len(each), 1)) for each, _, color in parts])
     return RoomCloud(points + rng.normal(scale=noise, size=points.shape), normals, colors)
+
+
+def the_cloud(*rooms: RoomCloud) -> PointCloud:
+    """Return the cloud of rooms, which three images have seen."""
+    points = np.concatenate([room.points for room in rooms])
+    normals = np.concatenate([room.normals for room in rooms])
+    return PointCloud(
+        (points @ WORLD_FROM_Z_UP.T).astype(np.float32),
+        (normals @ WORLD_FROM_Z_UP.T).astype(np.float32),
+        np.concatenate([room.colors for room in rooms]),
+        np.full(len(points), 3, np.uint8),
+    )
+
+
+def the_poses(*centers: tuple[float, float, float], metric: bool = True) -> Poses:
+    """Return level cameras at positions with z up."""
+    cameras = {}
+    for idx, center in enumerate(centers):
+        rotation = rotation_from_rotvec([0, 0.5 * idx, 0])
+        cameras[f"{idx}.jpg"] = Rigid3(rotation, -rotation @ WORLD_FROM_Z_UP @ np.array(center))
+    return Poses.without_points(cameras, frame="", scale="", metric=metric, axes=WorldAxes.LEVEL)
 
 
 def _inside(corners: Sequence[tuple[float, float]], rng: np.random.Generator, density: float) -> FloatArray:

@@ -50,17 +50,21 @@ SLOW = ("export.mesh_textured", "features.aliked", "masks.operator", "poses.loca
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 
-def contract_tests() -> list[ParameterSet]:
+def contract_tests(package: str) -> list[ParameterSet]:
+    """Return the tests of each stage that a package, or one below it, defines."""
     stages = Registry.installed().stages
-    builtin = [name for name in sorted(stages) if stages[name].function.__module__.startswith("pano_mvs.stages.")]
-    assert len(builtin) > 30
+    names = [name for name in sorted(stages) if f"{stages[name].function.__module__}.".startswith(f"{package}.")]
     return [
         pytest.param(contract_test, id=str(contract_test), marks=[pytest.mark.slow] if name in SLOW else [])
-        for name in builtin
+        for name in names
         for contract_test in stage_contract_tests(
             stages[name], settings=SETTINGS.get(name), inputs=INPUTS.get(name), size_hw=SIZES_HW.get(name, (32, 64))
         )
     ]
+
+
+BUILTIN = contract_tests("pano_mvs.stages")
+assert len(BUILTIN) > 200
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,6 +75,6 @@ def few_views() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("contract_test", contract_tests())
+@pytest.mark.parametrize("contract_test", BUILTIN)
 def test_keeps_the_contract(contract_test: ContractTest) -> None:
     contract_test.check()

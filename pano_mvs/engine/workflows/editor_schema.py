@@ -84,7 +84,7 @@ def _entry(specs: Mapping[str, StageSpec]) -> Schema:
     return {
         "type": "object",
         "required": ["use"],
-        "properties": {"use": _use(specs)},
+        **_use_of_entry(specs),
         "allOf": [_when(name, _ref(f"use.{name}") | {"required": _required(spec)}) for name, spec in specs.items()],
     }
 
@@ -93,7 +93,8 @@ def _override(specs: Mapping[str, StageSpec]) -> Schema:
     """Return the schema of an entry that may override an inherited one: no key is required, not even `use`."""
     return {
         "type": "object",
-        "properties": {"use": _use(specs), **_reserved()},
+        **_use_of_entry(specs),
+        "properties": _reserved(),
         "allOf": [_when(name, _ref(f"use.{name}")) for name in specs],
     }
 
@@ -112,6 +113,16 @@ def _inherited(specs: Mapping[str, StageSpec], use: str) -> Schema:
 
 def _when(use: str, then: Schema) -> Schema:
     return {"if": {"required": ["use"], "properties": {"use": {"const": use}}}, "then": then}
+
+
+def _use_of_entry(specs: Mapping[str, StageSpec]) -> Schema:
+    """Return which stage an entry may use: one that is registered, or any, with any settings, if it is optional."""
+    registered = _use(specs)
+    return {
+        "if": {"required": ["optional"], "properties": {"optional": {"const": True}}},
+        "then": {"properties": {"use": {"description": "the stage", "anyOf": [registered, {"type": "string"}]}}},
+        "else": {"properties": {"use": registered}},
+    }
 
 
 def _use(specs: Mapping[str, StageSpec]) -> Schema:

@@ -20,6 +20,7 @@ from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command
 from tests.stored import read_picture
+from tests.synthetic.exported_clouds import exported, the_cloud, the_poses
 
 
 def save(path: Path, points: np.ndarray, normal: ArrayLike = (0, -1, 0)) -> Path:
@@ -206,3 +207,8 @@ def test_what_cannot_be_compared_is_named(pano_mvs: Command, tmp_path: Path, fol
     assert (lost.code, "cannot be brought into the frame of the truth" in lost.flat) == (2, True)
     gone = pano_mvs("evaluate", "cloud", tmp_path / "no.ply", "--truth", folder)
     assert (gone.code, "no.ply: cannot be read" in gone.flat) == (2, True)
+
+
+def test_scores_of_a_cloud_do_not_depend_on_the_frame_of_the_file(tmp_path: Path) -> None:
+    upright = evaluate_cloud(exported(tmp_path, the_poses()), the_cloud().points_in_world)
+    assert upright.scores[0].f_score == 1

@@ -10,6 +10,7 @@ import pytest
 from pano_mvs_evaluation.capture import RunEvaluation, score_capture
 from pano_mvs_evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs_evaluation.poses import evaluate_poses
+from pano_mvs_evaluation.ranges import tables as depth_tables
 from pano_mvs_evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs_evaluation.tables import TextTable
 
@@ -85,3 +86,8 @@ def test_evaluations_print_their_main_figures_only() -> None:
 def test_a_table_is_readable_text() -> None:
     table = TextTable(("view", "MAE"), (("a", "0.1"), ("long", "2")), (("constant", "1"), ("constant", "9")))
     assert str(table).splitlines() == ["view      MAE", "a         0.1", "constant  1", "long      2", "constant  9"]
+
+
+def test_zero_has_no_sign_in_tables() -> None:
+    assert depth_tables._shown("psnr_db", {"psnr_db": -0.0}).count("-") == 0
+    assert "0" in depth_tables._shown("psnr_db", {"psnr_db": -0.0})

@@ -15,34 +15,21 @@ from ezdxf.filemanagement import readfile
 from pano_mvs_floor_plan.stages import FloorPlanParams, floor_plan
 
 from pano_mvs.api import Context, Files, PointCloud, Poses, RangeMap, WorldAxes
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.scene.upright import z_up_from_world
+from pano_mvs.geometry import Rigid3
 from tests.stored import read_picture
-from tests.synthetic.floor_plan_rooms import RoomCloud, distance_to, flat_ranges, room_cloud, samples, walls_of
+from tests.synthetic.floor_plan_rooms import (
+    WORLD_FROM_Z_UP,
+    distance_to,
+    flat_ranges,
+    room_cloud,
+    samples,
+    the_cloud,
+    the_poses,
+    walls_of,
+)
 
-WORLD_FROM_Z_UP = z_up_from_world().T
 STAIRS = ((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0))
 SVG_LINE = re.compile(r'<line x1="([-.\d]+)" y1="([-.\d]+)" x2="([-.\d]+)" y2="([-.\d]+)"/>')
-
-
-def the_cloud(*rooms: RoomCloud) -> PointCloud:
-    points = np.concatenate([room.points for room in rooms])
-    normals = np.concatenate([room.normals for room in rooms])
-    return PointCloud(
-        (points @ WORLD_FROM_Z_UP.T).astype(np.float32),
-        (normals @ WORLD_FROM_Z_UP.T).astype(np.float32),
-        np.concatenate([room.colors for room in rooms]),
-        np.full(len(points), 3, np.uint8),
-    )
-
-
-def the_poses(*centers: tuple[float, float, float], metric: bool = True) -> Poses:
-    """Cameras at positions with z up."""
-    cameras = {}
-    for idx, center in enumerate(centers):
-        rotation = rotation_from_rotvec([0, 0.5 * idx, 0])
-        cameras[f"{idx}.jpg"] = Rigid3(rotation, -rotation @ WORLD_FROM_Z_UP @ np.array(center))
-    return Poses.without_points(cameras, frame="", scale="", metric=metric, axes=WorldAxes.LEVEL)
 
 
 def planned(

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_run import box_run, frame_of_page, wall_color, wall_range
 from pano_mvs_page.scene_parts import ShareOptions
 from pano_mvs_page.share import share_run
 
 from tests.browsers.browser import Browser, open_browser
 from tests.foreign import npm_packages
-from tests.synthetic.box_run import box_run, frame_of_page, wall_color, wall_range
 
 pytestmark = pytest.mark.browser
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_run import NAMES, box_mesh, box_run
 from pano_mvs_page.scene_parts import ShareOptions
 from pano_mvs_page.share import share_run
 from pano_mvs_viewer.shown_scene import open_scene
@@ -25,7 +26,6 @@ from pano_mvs.results.run_output import load
 from pano_mvs.scene.image_file import write_png
 from tests.browsers.browser import Browser, open_browser
 from tests.hostile_names import contents
-from tests.synthetic.box_run import NAMES, box_mesh, box_run
 from tests.synthetic.viewed_scenes import SIZE_HW, box_cloud
 
 pytestmark = pytest.mark.browser

@@ -11,15 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pano_mvs_page.encoding import encode_jpeg
-from pano_mvs_page.page_folder import PageFolder
-from pano_mvs_page.scene_parts import RANGES_HW, ShareOptions
-from pano_mvs_page.share import share_run
-
-from pano_mvs.scene.image_file import decode_image, write_png
-from tests.browsers.browser import Browser, open_browser
-from tests.browsers.server import served
-from tests.synthetic.box_run import (
+from box_run import (
     NAMES,
     POINT_SIGMA,
     RELATIVE_SIGMA,
@@ -29,6 +21,14 @@ from tests.synthetic.box_run import (
     wall_color,
     wall_range,
 )
+from pano_mvs_page.encoding import encode_jpeg
+from pano_mvs_page.page_folder import PageFolder
+from pano_mvs_page.scene_parts import RANGES_HW, ShareOptions
+from pano_mvs_page.share import share_run
+
+from pano_mvs.scene.image_file import decode_image, write_png
+from tests.browsers.browser import Browser, open_browser
+from tests.browsers.server import served
 from tests.synthetic.viewed_scenes import HALF
 
 

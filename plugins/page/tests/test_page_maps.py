@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from box_run import box_run, frame_of_page
 from pano_mvs_page.maps import MapPlace, closed, coverage_colors, cut_height, place_around, run_plans, top_view
 from pano_mvs_page.share import share_run
 from test_share import value_of
@@ -17,7 +18,6 @@ from pano_mvs.results.run_output import load
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.upright import z_up_from_world
-from tests.synthetic.box_run import box_run, frame_of_page
 
 
 def cloud_of(points: np.ndarray, colors: np.ndarray, views: np.ndarray) -> PointCloud:

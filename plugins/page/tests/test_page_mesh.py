@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from box_run import POINT_SIGMA, box_mesh, box_run, frame_of_page, wall_color
 from pano_mvs_page.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
 from pano_mvs_page.mesh_file import SharedMesh, coarser, run_mesh, thinned
 from pano_mvs_page.scene_parts import outline
@@ -19,7 +20,6 @@ from test_share import value_of
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.meshes import TexturedArrays, encoded_texture, read_glb, write_glb
 from pano_mvs.results.run_output import load
-from tests.synthetic.box_run import POINT_SIGMA, box_mesh, box_run, frame_of_page, wall_color
 from tests.synthetic.viewed_scenes import HALF
 
 GLB_FROM_WORLD = np.diag([1.0, -1.0, -1.0])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from box_run import NAMES, box_run
 from pano_mvs_page.mesh_file import SharedMesh, joined_meshes, run_mesh
 from pano_mvs_page.share import page_from_world, share_run
 from pano_mvs_page.shown import shown_of
@@ -18,7 +19,6 @@ from pano_mvs.io.house_file import house_document
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.scene import House
 from pano_mvs.scene.image_file import write_png
-from tests.synthetic.box_run import NAMES, box_run
 from tests.synthetic.viewed_scenes import turned_poses
 
 ATTIC, AWAY = "attic.png", "away.png"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_run import NAMES, box_run
 from pano_mvs_page.scene_parts import ShareOptions
 from pano_mvs_page.share import Sight, given_rooms, rooms_by_sight, rooms_of, share_run
 from test_share import value_of
@@ -14,7 +15,6 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
-from tests.synthetic.box_run import NAMES, box_run
 
 
 def sight(center: tuple[float, float, float], turned: float) -> Sight:

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from box_run import NAMES, box_ranges, box_run
 from pano_mvs_page.encoding import encode_ranges, panorama_tiles, tile_layout
 from pano_mvs_page.page_folder import SCRIPTS
 from pano_mvs_page.scene_parts import ShareOptions
@@ -28,7 +29,6 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.image_file import write_png
-from tests.synthetic.box_run import NAMES, box_ranges, box_run
 from tests.synthetic.viewed_scenes import turned_poses, world_color
 
 
@@ -205,6 +205,16 @@ def test_a_folder_with_something_else_is_refused_and_kept(tmp_path: Path) -> Non
     assert (tmp_path / "mine" / "index.html").read_text() == "mine"
     with pytest.raises(UsageError, match="this is a file"):
         share_run(run, tmp_path / "mine" / "index.html")
+
+
+def test_a_place_below_a_file_is_a_mistake_and_no_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`share` advised to free some space, with the exit code of a full disk."""
+    monkeypatch.chdir(tmp_path)
+    run = box_run(tmp_path, points=200)
+    Path("afile").touch()
+    result = CliRunner().invoke(app, ["share", str(run.out), "--to", "afile/x"], env={"COLUMNS": "200"})
+    assert result.exit_code == 2, result.output
+    assert "afile/x: cannot be written (Not a directory). Give another folder" in " ".join(result.output.split())
 
 
 def test_an_interrupted_page_is_written_again(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from pano_mvs.cli.commands import COMMANDS
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.command import interrupted_by_termination
 from pano_mvs.cli.run.printing import has_scene, next_commands, print_summary
@@ -289,6 +290,13 @@ def here(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Toy:
     return toy
 
 
+@pytest.fixture
+def to_look_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commands that show results are installed, and no others of plugins."""
+    monkeypatch.setattr(COMMANDS, "names", lambda: ("share", "view"))
+
+
+@pytest.mark.usefixtures("to_look_at")
 def test_the_last_lines_are_the_next_commands(pano_mvs: Command, here: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(here.folder)
     ran = pano_mvs("run", "wf.yaml", "--images", "my photos", "--out", "my out", "--executor", "serial")
@@ -297,6 +305,7 @@ def test_the_last_lines_are_the_next_commands(pano_mvs: Command, here: Toy, monk
     assert "open my out/report.html in a browser\nnext:" in ran.text
 
 
+@pytest.mark.usefixtures("to_look_at")
 def test_a_run_with_failures_names_the_command_that_repeats_it(
     pano_mvs: Command, here: Toy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -326,6 +335,7 @@ def test_a_partial_run_names_the_command_for_the_rest(
     assert pano_mvs(*rest).code == 0
 
 
+@pytest.mark.usefixtures("to_look_at")
 def test_verdict_and_reasons_come_before_the_next_commands(
     here: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -342,6 +352,7 @@ def test_verdict_and_reasons_come_before_the_next_commands(
     assert [line.split()[1] for line in lines[start + 4 :]] == ["share"]
 
 
+@pytest.mark.usefixtures("to_look_at")
 def test_share_names_the_cache_if_another_one_is_set(finished: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     session = finished.session()
     output = _output(session.out, cloud=CloudSummary(points=9), cache=str(session.store_root))
@@ -349,6 +360,14 @@ def test_share_names_the_cache_if_another_one_is_set(finished: Toy, monkeypatch:
     assert next_commands(output, session) == [shlex.join(["pano-mvs", "share", out, "--to", f"{out}_page"])]
     monkeypatch.setenv("PANO_MVS_CACHE", str(finished.folder / "elsewhere"))
     assert next_commands(output, session)[-1].endswith(f"--cache {session.store_root}")
+
+
+def test_commands_that_are_not_installed_are_not_suggested(finished: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = finished.session()
+    output = _output(session.out, cloud=CloudSummary(points=9), files={"cloud.ply": ""})
+    for names in (("view",), ("share",), ()):
+        monkeypatch.setattr(COMMANDS, "names", lambda names=names: names)
+        assert [shlex.split(command)[1] for command in next_commands(output, session)] == list(names)
 
 
 def test_a_command_names_presets_and_leaves_out_defaults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.scene import Poses
 from pano_mvs.testing.room import capture_poses
 from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json
+from tests.cli.truth import constant_errors, pose_errors, range_errors
 from tests.io.images.pictures import png_chunk, xmp
 from tests.stored import read_picture
 
@@ -78,18 +79,19 @@ def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_the_papers_way_from_pictures_to_ranges(run: Callable[..., dict[str, Any]]) -> None:
+def test_the_papers_way_from_pictures_to_ranges(run: Callable[..., dict[str, Any]], rendered: Path) -> None:
     summary = run()
     params = {stage["name"]: stage["params"] for stage in summary["stages"]}
     assert params["depth"]["spacing"] == "uniform"
     assert (params["depth"]["near"], params["depth"]["far"]) == (0.05, 10)
     assert (params["depth"]["cost"], params["depth"]["window"], params["depth"]["selection"]) == ("sad", 7, "winner")
-    for name, view in summary["scores"]["views"].items():
+    constants = constant_errors(rendered / "truth")
+    for name, errors in range_errors(Path("out"), rendered / "truth").items():
         # Ranges of a plane sweep over uniform hypotheses are coarse far away; no constant comes near them all the same.
-        assert view["psnr_db"] > view["best_constant_psnr_db"] + 4, name
-        assert view["w_mae"] < 0.65 * view["best_constant_w_mae"], name
-        assert view["w_delta_105"] > view["best_constant_w_delta_105"], name
-        assert view["median_relative_error"] < 0.16, name
+        assert errors.psnr_db > max(constant.psnr_db for constant in constants[name]) + 4, name
+        assert errors.mae < 0.65 * min(constant.mae for constant in constants[name]), name
+        assert errors.near > max(constant.near for constant in constants[name]), name
+        assert errors.median < 0.16, name
     for name in ("000", "003"):
         ranges = read_range_tiff(Path("out") / f"range/{name}.tiff")
         assert ranges.shape == SIZE_HW
@@ -98,7 +100,7 @@ def test_the_papers_way_from_pictures_to_ranges(run: Callable[..., dict[str, Any
 
 
 @pytest.mark.slow
-def test_each_ablation_is_one_switch(run: Callable[..., dict[str, Any]]) -> None:
+def test_each_ablation_is_one_switch(run: Callable[..., dict[str, Any]], rendered: Path) -> None:
     full = run()
     unscaled = run("unscaled.enabled=true", out="unscaled")
     lengths = [np.linalg.norm(center) for center in unscaled["poses"]["centers"]]
@@ -107,9 +109,10 @@ def test_each_ablation_is_one_switch(run: Callable[..., dict[str, Any]]) -> None
     plain = run("depth.prefilter_diameter=0", "depth.derotate=false", "smooth.keep_confidence=1", out="plain")
     stages = {stage["name"]: stage["params"] for stage in plain["stages"]}
     assert (stages["depth"]["prefilter_diameter"], stages["smooth"]["keep_confidence"]) == (0, 1)
-    runs = [summary["scores"]["views"]["000.png"]["psnr_db"] for summary in (full, unscaled, plain)]
+    truth = rendered / "truth"
+    runs = [range_errors(Path(out), truth)["000"].psnr_db for out in ("out", "unscaled", "plain")]
     assert len(set(runs)) == 3
-    wrong = [summary["scores"]["poses"]["scale_ratio_error_max"] for summary in (full, unscaled)]
+    wrong = [pose_errors(Path(out), truth).scale_ratio_max for out in ("out", "unscaled")]
     assert wrong[0] < 0.5 * wrong[1]
 
 
@@ -137,25 +140,26 @@ stages:
   depth:    {use: depth.sweep, planes: 32, near: 0.5, far: 6}
   refined:  {use: depth.patchmatch, rounds: 2}
   checked:  {use: filters.consistency}
-  truth:    {use: evaluate.truth, truth: capture/truth}
+  exported: {use: export.ranges}
+  colmap:   {use: export.colmap}
 """
 
 
 @pytest.mark.slow
 def test_refinement_makes_more_pixels_consistent_and_all_more_precise(capture: Path, pano_mvs: Command) -> None:
     path = capture.parent / "planes.yaml"
-    scores = {}
+    views, errors = {}, {}
     for name, text in {"with": WORKFLOW, "without": WORKFLOW.replace("  refined:", "  # ")}.items():
         path.write_text(text)
         out = capture.parent / name
         outcome = pano_mvs("run", path, "--out", out)
         assert outcome.code == 0, outcome.text
-        scores[name] = run_json(out)
-    for view in scores["with"]["views"]:
-        name = view["name"]
-        other = next(v for v in scores["without"]["views"] if v["name"] == name)
-        assert view["consistent"] > other["consistent"]
-        after, before = (scores[way]["scores"]["views"][name]["median_relative_error"] for way in ("with", "without"))
+        views[name] = {view["name"]: view for view in run_json(out)["views"]}
+        errors[name] = range_errors(out, capture / "truth")
+    assert len(views["with"]) == len(errors["with"]) == 4
+    for name, view in views["with"].items():
+        assert view["consistent"] > views["without"][name]["consistent"]
+        after, before = (errors[way][Path(name).stem].median for way in ("with", "without"))
         assert after < 0.6 * before
 
 

@@ -6,6 +6,7 @@ import re
 import sys
 import textwrap
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -135,11 +136,6 @@ WAYS = [
     pytest.param(("serial", MISBEHAVIOURS), id="serial", marks=UNCLOSED),
     pytest.param(("processes", MISBEHAVIOURS), id="processes"),
     pytest.param(("processes", FATAL), id="processes-fatal", marks=[pytest.mark.slow, NEEDS_LINUX]),
-    pytest.param(
-        ("dask", MISBEHAVIOURS | FATAL),
-        id="dask",
-        marks=[pytest.mark.slow, NEEDS_LINUX, pytest.mark.filterwarnings("ignore")],
-    ),
 ]
 Misbehaved = tuple[dict[str, tuple[str, str]], Toy, RunOutput]
 
@@ -156,11 +152,9 @@ def run_or_give_up(toy: Toy, executor: str) -> RunOutput:
     return outputs[0]
 
 
-@pytest.fixture(scope="module", params=WAYS)
-def misbehaved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Misbehaved:
-    """A run of a capture in which five units of a stage are well-behaved, and each other one misbehaves in its way."""
-    executor, ways = request.param
-    toy = toy_in(tmp_path_factory.mktemp("misbehaved"))
+def misbehave(folder: Path, executor: str, ways: dict[str, tuple[str, str]]) -> Misbehaved:
+    """Run a capture in which five units of a stage are well-behaved, and each other one misbehaves in its way."""
+    toy = toy_in(folder)
     code = ""
     for number, deed in enumerate([*(deed for deed, _ in ways.values()), *HARMLESS.values()], 100):
         toy.number(f"{number}.txt", str(number))
@@ -169,8 +163,8 @@ def misbehaved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
     return ways, toy, run_or_give_up(toy, executor)
 
 
-def test_a_unit_that_misbehaves_fails_with_the_reason(misbehaved: Misbehaved) -> None:
-    """NaN in the metrics of a plugin ended the thread that served its worker, and the run waited for ever."""
+def check_reasons(misbehaved: Misbehaved) -> None:
+    """Check that each unit that misbehaves fails with its reason, and no other one."""
     ways, _, output = misbehaved
     causes = {unit.item: unit.cause for unit in output.summary.failures if unit.stage == "scaled"}
     found = {what: causes.pop(f"{number}.txt", "") for number, what in enumerate(ways, 100)}
@@ -178,7 +172,8 @@ def test_a_unit_that_misbehaves_fails_with_the_reason(misbehaved: Misbehaved) ->
     assert causes == {}, "others go on"
 
 
-def test_the_others_go_on_and_the_cache_stays_readable(misbehaved: Misbehaved) -> None:
+def check_others(misbehaved: Misbehaved) -> None:
+    """Check that all others were computed and stored."""
     _, toy, output = misbehaved
     assert output.summary.exit_code == 3
     (scaled,) = (stage for stage in output.summary.stages if stage.name == "scaled")
@@ -188,6 +183,21 @@ def test_the_others_go_on_and_the_cache_stays_readable(misbehaved: Misbehaved) -
     assert len(toy.plan()["scaled"].cached) == 5 + len(HARMLESS)
     assert store.damaged == []
     assert not list((toy.folder / "cache" / "tmp").iterdir())
+
+
+@pytest.fixture(scope="module", params=WAYS)
+def misbehaved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Misbehaved:
+    executor, ways = request.param
+    return misbehave(tmp_path_factory.mktemp("misbehaved"), executor, ways)
+
+
+def test_a_unit_that_misbehaves_fails_with_the_reason(misbehaved: Misbehaved) -> None:
+    """NaN in the metrics of a plugin ended the thread that served its worker, and the run waited for ever."""
+    check_reasons(misbehaved)
+
+
+def test_the_others_go_on_and_the_cache_stays_readable(misbehaved: Misbehaved) -> None:
+    check_others(misbehaved)
 
 
 def test_what_a_value_consists_of_is_the_plugins_error(toy: Toy) -> None:

@@ -16,8 +16,7 @@ from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from pano_mvs.engine.workflows.workflow import WorkflowReader
 from pano_mvs.session.session import presets_folder
 from tests.engine.toy import HELPER, PLUGIN
-
-SHIPPED = sorted(presets_folder().glob("*.yaml"))
+from tests.presets import usable_presets
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +32,7 @@ def mistakes(schema: dict[str, Any], text: str) -> list[str]:
     return [error.message for error in jsonschema.Draft202012Validator(schema).iter_errors(value)]
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", usable_presets(), ids=lambda path: path.stem)
 def test_shipped_workflows_are_valid(schema: dict[str, Any], path: Path) -> None:
     assert mistakes(schema, path.read_text(encoding="utf-8")) == []
 
@@ -68,6 +67,12 @@ HEAD = "pano_mvs: 1\nstages:\n  images: {use: source.folder, path: x}\n"
         HEAD + "  a: {use: depth.sweep, gate: {completeness: high}}",
         HEAD + "  a: {use: depth.sweep, gate: {completeness: {mim: 1}}}",
         HEAD + "  a: {use: depth.sweep, gate: {completeness: {}}}",
+        HEAD + "  a: {use: nobodys.stage}",
+        HEAD + "  a: {use: nobodys.stage, optional: false}",
+        HEAD + "  a: {use: 3, optional: true}",
+        HEAD + "  a: {optional: true}",
+        HEAD + "  a: {use: depth.sweep, optional: true, plans: 3}",
+        "pano_mvs: 1\nextends: quickstart\nstages: {a: {use: nobodys.stage}}",
     ],
 )
 def test_wrong_workflows_are_not(schema: dict[str, Any], text: str) -> None:
@@ -79,7 +84,10 @@ def test_wrong_workflows_are_not(schema: dict[str, Any], text: str) -> None:
     [
         HEAD + "  a: {use: depth.sweep, gate: {completeness: 0.5, far: {max: 100}}, retries: null, to: draft}",
         HEAD + "  a: {use: depth.sweep, near: null, in: {ref: images}, memory: 2GB, timeout_s: 10}",
+        HEAD + "  a: {use: nobodys.stage, optional: true, by: 3, in: {poses: images}}",
+        HEAD + "  a: {use: depth.sweep, optional: true, planes: 3}",
         "pano_mvs: 1\nextends: quickstart",
+        "pano_mvs: 1\nextends: quickstart\nstages: {a: {use: nobodys.stage, optional: true, by: 3}}",
         "pano_mvs: 1\nextends: [quickstart, a.yaml]\nstages: {depth: {planes: 64}, smooth: , d: {use: depth.sweep}}",
     ],
 )
@@ -89,7 +97,9 @@ def test_right_ones_are(schema: dict[str, Any], text: str) -> None:
 
 def test_it_describes_what_an_editor_shows(schema: dict[str, Any]) -> None:
     registry = Registry.installed()
-    assert set(schema["$defs"]["stage"]["properties"]["use"]["enum"]) == set(registry.stages)
+    used = schema["$defs"]["stage"]["else"]["properties"]["use"]
+    assert set(used["enum"]) == set(registry.stages)
+    assert schema["$defs"]["stage"]["then"]["properties"]["use"]["anyOf"][0] == used, "optional ones are offered, too"
     for name, spec in registry.stages.items():
         settings = schema["$defs"][f"use.{name}"]
         assert set(settings["properties"]) == {*spec.params_type.model_fields, *RESERVED_KEYS}

@@ -17,6 +17,7 @@ from pano_mvs.engine.workflows.workflow import Workflow, WorkflowReader, find_wo
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.session import open_session, presets_folder
 from tests.engine.conftest import Toy, ran
+from tests.presets import usable_presets
 
 
 def problems(toy: Toy, text: str) -> list[str]:
@@ -66,7 +67,7 @@ def test_an_optional_stage_that_no_plugin_offers_is_left_out_and_named(toy: Toy)
 def test_the_models_of_presets_need_no_ranges() -> None:
     """`--until colmap` computed everything before masks.moving, 262 s in place of 40."""
     registry = Registry.installed()
-    for preset in presets_folder().glob("*.yaml"):
+    for preset in usable_presets():
         workflow = load_workflow(preset, registry, presets=presets_folder())
         if "colmap" not in workflow.stages or workflow.stages["colmap"].spec.name != "export.colmap":
             continue

@@ -402,18 +402,15 @@ def with_exports(folder: Path, *uses: StageOutcome) -> list[Path]:
 
 def test_exports_of_poses_and_cloud_are_made_of_the_whole_capture(tmp_path: Path) -> None:
     tiles = StageOutcome(name="tiles", use="export.tiles_3d", params={"tile_points": 1000})
-    plan = StageOutcome(name="plan", use="export.floor_plan", params={"formats": ["svg"]})
     textured = StageOutcome(name="textured", use="export.mesh_textured")
-    outs = with_exports(tmp_path, tiles, plan, textured, StageOutcome(name="ply", use="export.ply"))
+    outs = with_exports(tmp_path, tiles, textured, StageOutcome(name="ply", use="export.ply"))
     merged = merge_outputs(outs, tmp_path / "merged")
     tileset = json.loads((tmp_path / "merged/tiles_3d/tileset.json").read_text())
     low, high = _corners(tileset["root"]["boundingVolume"]["box"])
     points = read_ply(tmp_path / "merged/cloud.ply").points_in_world
     turned = points @ np.array(tileset["extras"]["file_from_world"]).T
     np.testing.assert_allclose([low, high], [turned.min(axis=0), turned.max(axis=0)], atol=1e-3)
-    about = json.loads((tmp_path / "merged/floor_plan/floor_plan.json").read_text())
-    assert sum(len(storey["cameras"]) for storey in about["storeys"]) == 30
-    assert {"tiles_3d/tileset.json", "floor_plan/floor_plan.json"} <= merged.summary.files.keys()
+    assert "tiles_3d/tileset.json" in merged.summary.files
     assert "of each block, and not merged: the files of export.mesh_textured" in merged.summary.notes
     assert not list((tmp_path / "merged").glob(".tmp-*"))
 
@@ -435,7 +432,7 @@ def test_an_export_that_fails_is_named_and_loses_nothing(tmp_path: Path) -> None
 def test_exports_are_computed_as_units_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They had one thread, and the same random numbers whatever their settings; sys.exit in one ended the merge."""
     registry = Registry.installed()
-    spec = registry.stages["export.floor_plan"]
+    spec = registry.stages["export.tiles_3d"]
     draws: list[tuple[int, float]] = []
 
     def probe(params: Params, ctx: Context, **_: object) -> Files:
@@ -443,17 +440,17 @@ def test_exports_are_computed_as_units_of_a_run(tmp_path: Path, monkeypatch: pyt
         if len(draws) == 4:
             sys.exit("enough")
         ctx.note("as a unit")
-        (ctx.scratch / "plan.txt").write_text("plan")
-        return Files({f"floor_plan/{len(draws)}.txt": ctx.scratch / "plan.txt"})
+        (ctx.scratch / "tile.txt").write_text("tile")
+        return Files({f"tiles_3d/{len(draws)}.txt": ctx.scratch / "tile.txt"})
 
-    registry.stages["export.floor_plan"] = replace(spec, function=probe, extras={"params": "params", "ctx": "ctx"})
+    registry.stages["export.tiles_3d"] = replace(spec, function=probe, extras={"params": "params", "ctx": "ctx"})
     monkeypatch.setattr(Registry, "installed", lambda: registry)
     monkeypatch.setattr("pano_mvs.session.merging.merge._is_repeated", lambda _: True)
-    plans = [StageOutcome(name=f"plan_{n}", use=spec.name, params={"width_px": 100 * n}) for n in (3, 4)]
-    outs = with_exports(tmp_path, *plans)
+    tiles = [StageOutcome(name=f"tiles_{n}", use=spec.name, params={"tile_points": 1000 * n}) for n in (3, 4)]
+    outs = with_exports(tmp_path, *tiles)
     merged = merge_outputs(outs, tmp_path / "merged")
-    assert {"floor_plan/1.txt", "floor_plan/2.txt"} == {*merged.summary.files}
-    assert "export.floor_plan: as a unit" in merged.summary.notes
+    assert {"tiles_3d/1.txt", "tiles_3d/2.txt"} == {*merged.summary.files}
+    assert "export.tiles_3d: as a unit" in merged.summary.notes
     again = merge_outputs(outs, tmp_path / "again")
     assert any("was not repeated for the merged capture: " in note and "enough" in note for note in again.summary.notes)
     assert draws[:2] == draws[2:]
@@ -473,9 +470,9 @@ def test_exports_of_an_earlier_merge_do_not_stay(tmp_path: Path) -> None:
 
 
 def test_stages_of_a_block_cannot_lead_outside(tmp_path: Path) -> None:
-    plan = StageOutcome(name="../../outside", use="export.floor_plan", params={"formats": ["svg"]})
-    merged = merge_outputs(with_exports(tmp_path, plan), tmp_path / "merged")
-    assert "floor_plan/floor_plan.json" in merged.summary.files
+    tiles = StageOutcome(name="../../outside", use="export.tiles_3d")
+    merged = merge_outputs(with_exports(tmp_path, tiles), tmp_path / "merged")
+    assert "tiles_3d/tileset.json" in merged.summary.files
     assert not list(tmp_path.rglob("outside*"))
 
 
@@ -483,43 +480,41 @@ def test_exports_need_no_numbers_of_views_in_the_files_of_blocks(tmp_path: Path)
     """By default, export.ply writes none."""
     outs = with_exports(
         tmp_path,
-        StageOutcome(name="plan", use="export.floor_plan"),
+        StageOutcome(name="tiles", use="export.tiles_3d"),
         StageOutcome(name="mesh", use="export.mesh", params={"depth": 5}),
     )
     for out in outs:
         write_ply(out / "cloud.ply", read_ply(out / "cloud.ply"), file_from_world=z_up_from_world())
     merged = merge_outputs(outs, tmp_path / "merged")
-    assert {"floor_plan/floor_plan.json", "mesh.ply"} <= merged.summary.files.keys()
+    assert {"tiles_3d/tileset.json", "mesh.ply"} <= merged.summary.files.keys()
 
 
 def test_two_exports_of_the_same_files_are_not_mixed(tmp_path: Path) -> None:
-    plans = [StageOutcome(name=f"plan_{n}", use="export.floor_plan", params={"width_px": 100 * n}) for n in (3, 4)]
-    merged = merge_outputs(with_exports(tmp_path, *plans), tmp_path / "merged")
-    assert (
-        json.loads((tmp_path / "merged/floor_plan/floor_plan.json").read_text())["storeys"][0]["plan_size_px"][0] <= 300
-    )
-    assert any("another export has written floor_plan/" in note for note in merged.summary.notes)
+    tiles = [StageOutcome(name=f"tiles_{n}", use="export.tiles_3d", params={"tile_points": n}) for n in (1000, 100000)]
+    merged = merge_outputs(with_exports(tmp_path, *tiles), tmp_path / "merged")
+    tileset = json.loads((tmp_path / "merged/tiles_3d/tileset.json").read_text())
+    assert tileset["root"]["children"], "those of the first, for which the cloud is too large for one tile"
+    assert any("another export has written tiles_3d/" in note for note in merged.summary.notes)
 
 
 def test_what_lies_in_the_way_of_an_export_is_no_error_of_the_merge(tmp_path: Path) -> None:
-    outs = with_exports(tmp_path, StageOutcome(name="plan", use="export.floor_plan"))
+    outs = with_exports(tmp_path, StageOutcome(name="tiles", use="export.tiles_3d"))
     (tmp_path / "merged").mkdir()
     (tmp_path / "merged/.pano-mvs-output").touch()
-    (tmp_path / "merged/floor_plan").write_text("mine")
+    (tmp_path / "merged/tiles_3d").write_text("mine")
     merged = merge_outputs(outs, tmp_path / "merged")
-    assert any("export.floor_plan was not repeated for the merged capture" in note for note in merged.summary.notes)
-    assert (tmp_path / "merged/floor_plan").read_text() == "mine"
+    assert any("export.tiles_3d was not repeated for the merged capture" in note for note in merged.summary.notes)
+    assert (tmp_path / "merged/tiles_3d").read_text() == "mine"
 
 
 def test_an_exported_file_that_somebody_changed_stays(tmp_path: Path) -> None:
-    plan = StageOutcome(name="plan", use="export.floor_plan", params={"formats": ["svg"]})
-    outs = with_exports(tmp_path, plan)
+    outs = with_exports(tmp_path, StageOutcome(name="tiles", use="export.tiles_3d"))
     merge_outputs(outs, tmp_path / "merged")
-    (tmp_path / "merged/floor_plan/storey_0.svg").write_text("mine")
+    (tmp_path / "merged/tiles_3d/tileset.json").write_text("mine")
     for out in outs:
         RunSummary.read(out).model_copy(update={"stages": ()}).write(out)
     merge_outputs(outs, tmp_path / "merged")
-    assert [path.name for path in (tmp_path / "merged/floor_plan").iterdir()] == ["storey_0.svg"]
+    assert [path.name for path in (tmp_path / "merged/tiles_3d").iterdir()] == ["tileset.json"]
 
 
 def test_no_export_is_repeated_without_points(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 
-FOLDER = Path(__file__).parent.parent / "plugins" / "pano_mvs_example"
+FOLDER = Path(__file__).parents[1] / "pano_mvs_example"
 
 
 def run(*arguments: str, cwd: Path) -> str:
