@@ -3,7 +3,8 @@
 They are registered through the entry point `pano_mvs.plugins`, like stages of plugins.
 """
 
-from pano_mvs.stages.depth import exchange, full_size, known_floors, nearest, patchmatch, plain_surfaces, sweep
+from pano_mvs.stages.depth import exchange, full_size, known_floors, patchmatch, plain_surfaces, sweep
+from pano_mvs.stages.depth_planes import scale_planes, scene_planes, structure
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.colmap_lenses import colmap_lenses
 from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
@@ -19,20 +20,20 @@ from pano_mvs.stages.filters import (
     guided,
     median,
     planes,
-    scale_planes,
     scale_ranges,
-    scene_planes,
     sky,
     speckle,
-    structure,
 )
-from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
+from pano_mvs.stages.fusion import photographs, scale_cloud, vote
+from pano_mvs.stages.global_descriptors import vlad
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge
-from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad
+from pano_mvs.stages.matches_weak import weak
+from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential
+from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
+from pano_mvs.stages.poses_frame import level, scale, unit_translations
 from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.source import folder
-from pano_mvs.stages.weak_images import weak
+from pano_mvs.stages.views import nearest

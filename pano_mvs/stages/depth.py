@@ -26,7 +26,6 @@ from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.preparation import planes_before
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.algorithms.views import select_views
 from pano_mvs.api import (
     NOT_IN_KEY,
     All,
@@ -40,7 +39,6 @@ from pano_mvs.api import (
     Poses,
     RangeMap,
     RegisteredIn,
-    Views,
     arguments_from,
     params_from,
     settings_from,
@@ -49,7 +47,7 @@ from pano_mvs.api import (
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.io.growing_arrays import GrowingArrays
-from pano_mvs.scene.pose_groups import require_one_group, require_two_cameras
+from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.filters import bytes_per_pixel
 
@@ -163,17 +161,6 @@ def known_floors(poses: One[Poses], images: All[Panorama], ctx: Context) -> Stru
     found = floors_of_groups(poses, images, rng=ctx.rng)
     ctx.metric("planes", len(found))
     return found
-
-
-@stage("views.nearest", settings=select_views)
-def nearest(poses: One[Poses], params: Params, ctx: Context) -> Views:
-    """Choose images that see the same points from sufficiently different positions, best first."""
-    require_two_cameras(poses)
-    views = select_views(poses, **arguments_from(select_views, params))
-    for name in poses.names:
-        if name not in views.neighbours:
-            ctx.reject(name, "no other image was taken from a different position nearby")
-    return views
 
 
 @params_from(refine_range)

@@ -22,11 +22,7 @@ from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.sky import MAX_SOURCES, sky_pixels
 from pano_mvs.algorithms.patchmatch.exchange import respect_free_space
 from pano_mvs.algorithms.scales import sharp_halvings
-from pano_mvs.algorithms.structure.laid import OtherView
-from pano_mvs.algorithms.structure.lay import MAX_LAID_SOURCES, lay_structure
-from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.api import (
-    All,
     Context,
     Each,
     Near,
@@ -43,7 +39,6 @@ from pano_mvs.api import (
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
-from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import WORLD_UP
 
 
@@ -94,77 +89,6 @@ def sky(
         found = found if range_map.sky is None else found | range_map.sky
         result = with_ranges(replace(range_map, sky=found), range_map.range)
         ctx.metric("sky", share_of_sphere(found))
-    ctx.metric("completeness", float(result.valid.mean()))
-    ctx.metric("consistent", float((result.confidence >= CONSISTENT_CONFIDENCE[0]).mean()))
-    return result
-
-
-@stage("depth.scene_planes", settings=find_structure)
-def scene_planes(
-    poses: One[Poses], ranges: All[RangeMap], images: All[Panorama], params: Params, ctx: Context
-) -> Structure:
-    """Find the level and upright planes of a place in all range maps, and the mirrors on these.
-
-    Planes are placed by the lines where they meet. A mirror is where the pictures show, differently in each view, what
-    the room in front of a plane predicts.
-
-    Use it after poses.level: without known gravity, there are none.
-    """
-    found = find_structure(
-        poses,
-        ranges,
-        lambda name: images[name].load(),
-        rng=ctx.rng,
-        threads=ctx.threads,
-        **arguments_from(find_structure, params),
-    )
-    ctx.metric("planes", len(found))
-    ctx.metric("mirrors", len(found.mirror_corners))
-    return found
-
-
-@params_from(lay_structure, own_last=True)
-class StructureParams(Params):
-    """Settings of depth.structure."""
-
-    enabled: bool = Field(default=True, description="false returns the range maps unchanged")
-
-
-@stage("depth.structure", memory=bytes_per_pixel(200, each_source=12))
-def structure(
-    range_map: Each[RangeMap],
-    image: Each[Panorama],
-    pose: Each[Pose],
-    sources: Near[RangeMap],
-    source_poses: Near[Pose],
-    source_images: Near[Panorama],
-    planes: One[Structure],
-    params: StructureParams,
-    ctx: Context,
-) -> RangeMap:
-    """Move pixels to the planes of depth.scene_planes that they show, unless other views contradict.
-
-    Confirmed pixels with texture move only a little, those without texture farther. Masked pixels get no range. Mirrors
-    get the range of their pane, and confidence 1; windows that of their wall, and confidence 2.
-    """
-    require_one_group(pose, source_poses)
-    result, share = range_map, 0.0
-    if params.enabled and len(planes):
-        used = list(zip(sources, source_poses, source_images, strict=True))[:MAX_LAID_SOURCES]
-        result, share = lay_structure(
-            range_map,
-            image.load(),
-            planes,
-            cam_from_world=pose.cam_from_world,
-            sources=[
-                OtherView(ranges, other.cam_from_world, source.load(), source.load_mask())
-                for ranges, other, source in used
-            ],
-            group=pose.group,
-            valid=image.load_mask(),
-            **arguments_from(lay_structure, params),
-        )
-    ctx.metric("on_planes", share)
     ctx.metric("completeness", float(result.valid.mean()))
     ctx.metric("consistent", float((result.confidence >= CONSISTENT_CONFIDENCE[0]).mean()))
     return result
@@ -278,19 +202,6 @@ def scale_ranges(range_map: Each[RangeMap], pose: Each[Pose], params: ScaleRange
     if pose.group != params.group:
         return _measured(range_map, ctx)
     return _measured(replace(range_map, range=range_map.range * np.float32(params.factor)), ctx)
-
-
-@stage("depth.scale_planes")
-def scale_planes(planes: One[Structure], params: ScaleRangesParams, ctx: Context) -> Structure:
-    """Multiply planes and mirrors by a factor, for results whose scale is known only later; see `pano-mvs scale`."""
-    scaled, mirrors = (groups == params.group for groups in (planes.group_idx, planes.mirror_group_idx))
-    ctx.metric("planes", len(planes))
-    ctx.metric("mirrors", len(planes.mirror_corners))
-    return replace(
-        planes,
-        offsets=np.where(scaled, params.factor, 1.0) * planes.offsets,
-        mirror_corners=np.where(mirrors, params.factor, 1.0)[:, None, None] * planes.mirror_corners,
-    )
 
 
 @stage("filters.fast_bilateral_solver", settings=fast_bilateral_solver, memory=bytes_per_pixel(190))

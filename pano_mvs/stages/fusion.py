@@ -15,28 +15,24 @@ from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
-from pano_mvs.algorithms.points.tracking import sample_surface, track_points
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.api import (
     All,
     Context,
-    Each,
     One,
     Panorama,
     Params,
     PointCloud,
     Pose,
-    Poses,
     RangeMap,
-    arguments_from,
     settings_from,
     stage,
 )
 from pano_mvs.io.growing_arrays import GrowingArrays
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
+from pano_mvs.scene.surfaces import Structure
 
 
 @stage("fusion.vote", settings=FusionSettings)
@@ -171,30 +167,3 @@ def _joined_in_files(clouds: Iterable[PointCloud], *, folder: Path) -> PointClou
 def _min_views(settings: FusionSettings, views: int) -> int:
     """Return the number of views that must agree on a point, at most the number of views."""
     return min(settings.min_views, max(1, views))
-
-
-@stage("points.surface", settings=sample_surface)
-def surface(image: Each[Panorama], range_map: Each[RangeMap], params: Params, ctx: Context) -> SurfaceSamples:
-    """Sample the surfaces that each view sees, evenly over its sphere, as input of points.tracked."""
-    samples = sample_surface(image.load(), image.load_mask(), range_map, **arguments_from(sample_surface, params))
-    ctx.metric("points", len(samples))
-    return samples
-
-
-@stage("points.tracked", settings=track_points)
-def tracked(
-    poses: One[Poses], samples: All[SurfaceSamples], ranges: All[RangeMap], params: Params, ctx: Context
-) -> TrackedPoints:
-    """Select evenly distributed points with the views that see them: initial points for splats, tracks for COLMAP."""
-    settings = arguments_from(track_points, params)
-    settings["min_views"] = min(settings["min_views"], len(samples))
-    usable = {name: samples[name] for name in samples if name in ranges}
-    points = track_points(usable, poses, ranges.__getitem__, rng=ctx.rng, **settings)
-    ctx.metric("points", len(points))
-    ctx.metric("views_per_point", len(points.track_point_idx) / max(len(points), 1))
-    if len(points) < settings["count"]:
-        ctx.note(
-            f"only {len(points)} of {settings['count']} points: the range maps contain no more reliable ones. Raise "
-            "`count` of points.surface, or lower its `min_confidence`"
-        )
-    return points

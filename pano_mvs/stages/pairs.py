@@ -18,11 +18,9 @@ from pano_mvs.algorithms.matching.pair_selection import (
     position_pairs,
     retrieval_pairs,
 )
-from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.api import (
     All,
     Context,
-    Each,
     Features,
     GlobalDescriptor,
     InputError,
@@ -116,12 +114,6 @@ def sequential(
     pairs = loop_closing_pairs(images, descriptors or {}, **settings)
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
-
-
-@stage("global.vlad", settings=vlad_descriptor)
-def vlad(features: Each[Features], params: Params) -> GlobalDescriptor:
-    """Compute a global descriptor of each panorama, for pairs.retrieval and loop closure."""
-    return vlad_descriptor(features, **arguments_from(vlad_descriptor, params))
 
 
 @stage("pairs.retrieval", settings=retrieval_pairs)

@@ -90,3 +90,12 @@ def test_the_table_of_stages_has_all_of_quickstart_that_the_cloud_needs() -> Non
     shown = [row[0].strip("`") for row in rows("stages")]
     end = used.index("fusion.vote") + 1
     assert shown[:end] == used[:end]
+
+
+def test_a_stage_is_in_a_file_that_begins_as_its_name_does() -> None:
+    """`depth.structure` was in a file of filters, and `views.nearest` in one of depth."""
+    registry = Registry()
+    registry.add_module(stages, "pano-mvs")
+    for name, spec in registry.stages.items():
+        folder, _, file = spec.function.__module__.removeprefix("pano_mvs.stages.").rpartition(".")
+        assert (folder or file).startswith(name.partition(".")[0]), name

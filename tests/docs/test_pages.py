@@ -20,7 +20,7 @@ from pano_mvs.io.ply import read_ply
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.io.rig_calibration import MODELS, read_rig
 from pano_mvs.scene import FilePart
-from pano_mvs.stages.frame import ScaleParams
+from pano_mvs.stages.poses_frame import ScaleParams
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Command, run_json

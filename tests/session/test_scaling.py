@@ -30,9 +30,10 @@ from pano_mvs.session.scaling import (
 )
 from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import _scale_notes, camera_height, height_note
-from pano_mvs.stages.filters import ScaleRangesParams, scale_planes, scale_ranges
-from pano_mvs.stages.frame import ScaleParams, scale
+from pano_mvs.stages.depth_planes import scale_planes
+from pano_mvs.stages.filters import ScaleRangesParams, scale_ranges
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud
+from pano_mvs.stages.poses_frame import ScaleParams, scale
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.io.test_ply import vertices
 from tests.synthetic.floor_plan_rooms import room_cloud, the_cloud, the_poses

@@ -30,7 +30,7 @@ from pano_mvs.stages.exports.colmap import (
     colmap_faces,
     colmap_masks,
 )
-from pano_mvs.stages.fusion import surface, tracked
+from pano_mvs.stages.points import surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.stored import read_picture
 from tools.benchmarks.colmap_dense import deliver, fused_points, wall_distances, write_workspace

@@ -31,9 +31,10 @@ from pano_mvs.stages.exports.colmap import (
 )
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.filters import ConsistencyParams, consistency
-from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
-from pano_mvs.stages.fusion import tracked, vote
+from pano_mvs.stages.fusion import vote
+from pano_mvs.stages.points import tracked
 from pano_mvs.stages.poses import known_groups, known_poses
+from pano_mvs.stages.poses_frame import BaselineParams, ScaleParams, level, scale
 from pano_mvs.testing.tiny_capture import tiny_capture
 from tests.synthetic.two_rooms import LARGE, ORDER, SMALL, FusionParams, Rooms, context, fused, placed
 

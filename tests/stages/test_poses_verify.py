@@ -13,8 +13,8 @@ from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.stages.depth import nearest
 from pano_mvs.stages.poses import ScaledTranslationParams, scaled_translation, verify
+from pano_mvs.stages.views import nearest
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 VerifyParams = Registry.installed().stages["poses.verify"].params_type

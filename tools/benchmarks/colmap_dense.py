@@ -26,7 +26,7 @@ from pano_mvs.io.ply import read_ply_points
 from pano_mvs.scene import Files, Panorama, Poses, RangeMap
 from pano_mvs.scene.files import item_stems
 from pano_mvs.stages.exports.colmap import DenseParams, FacesParams, colmap_dense, colmap_faces
-from pano_mvs.stages.fusion import surface, tracked
+from pano_mvs.stages.points import surface, tracked
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along
 from tests.synthetic.scenes import SCENES, Scene
 from tools.benchmarks.captures import Capture, scene_capture

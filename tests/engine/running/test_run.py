@@ -329,7 +329,7 @@ def test_helpers_of_one_plugin_are_not_those_of_another(toy: Toy) -> None:
 
 
 def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:
-    toy.edit("plug.py", lambda text: "from pano_mvs.stages.depth import nearest\n" + text)
+    toy.edit("plug.py", lambda text: "from pano_mvs.stages.views import nearest\n" + text)
     session = toy.session()
     assert session.registry.stages["views.nearest"].code_digest == ""
 
