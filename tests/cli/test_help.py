@@ -57,7 +57,7 @@ def offered(*words: str, shell: str = "bash") -> list[str]:
 
 
 def test_commands_and_options_are_offered() -> None:
-    assert offered("ru") == ["run"]
+    assert "run" in offered("ru")
     assert "doctor" in offered("")
     assert "--images" in offered("run", "quickstart", "--i")
 
