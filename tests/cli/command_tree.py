@@ -1,7 +1,7 @@
 """The commands of the command line, those of plugins among them.
 
-`python -m tests.cli.command_tree` starts the help of each; `python -m tests.cli.command_tree pano_mvs_tours` does so where
-that package was deleted from an installation.
+`python -m tests.cli.command_tree` starts the help of each; with `pano_mvs_tours` behind it, in an installation from
+which that package was deleted.
 """
 
 from __future__ import annotations
