@@ -84,7 +84,11 @@ class PluginGroup(TyperGroup):
         if full not in COMMANDS.names() or "." in cmd_name:
             return None
         try:
-            return _command(COMMANDS.get(full), cmd_name)
+            command = COMMANDS.get(full)
+            options = getattr(command, _OPTIONS, None)
+            if not (options is None or isinstance(command, typer.Typer) or self._describes):
+                command = _with_options(command, options())
+            return _command(command, cmd_name)
         except PluginError as error:
             return _command(_unusable(error), cmd_name, ignore_unknown_options=True, allow_extra_args=True)
 
@@ -138,6 +142,8 @@ _OPTIONS = "__pano_mvs_options__"
 def takes_options(options: Callable[[], Mapping[str, RunOption]]) -> Decorator:
     """Return a decorator of a command that takes options of plugins, too: as argument `options`, name to values.
 
+    The command takes its own options as a record, by `pano_mvs.cli.options.takes_record`.
+
     Args:
         options: returns the options by name; it is called when the command is run or described.
     """
@@ -147,6 +153,15 @@ def takes_options(options: Callable[[], Mapping[str, RunOption]]) -> Decorator:
         return command
 
     return extend
+
+
+def options_of_runs() -> dict[str, RunOption]:
+    """Return the options that executors and observers add to `pano-mvs run` and to what runs workflows, by name."""
+    from pano_mvs.engine.executors.choose import executor_options
+    from pano_mvs.session.observers import observer_options
+
+    load_files()
+    return {**executor_options(), **observer_options()}
 
 
 def _with_options(command: Callable[..., None], options: Mapping[str, RunOption]) -> Callable[..., None]:
