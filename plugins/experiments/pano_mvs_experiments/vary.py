@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, PanoMvsError, UsageError, WorkflowError
@@ -328,7 +329,13 @@ class PlannedUnits:
     run: PlannedRun
     units: int
     cached: int
-    is_least: bool  # whether there may be more, whose number depends on results
+    # "" if the number is exact, "up to" if results may turn out equal, "about" if further units depend on results
+    bound: Literal["", "up to", "about"]
+
+    @property
+    def shown(self) -> str:
+        """The number of units as text."""
+        return f"{self.bound} {self.units}".strip() if self.units else "0"
 
 
 def planned_units(experiment: Experiment) -> list[PlannedUnits]:
@@ -342,17 +349,18 @@ def planned_units(experiment: Experiment) -> list[PlannedUnits]:
         plan = plan_session(run.session)
         identities = _identities(run.session)
         expected = {one.stage: one.units for one in plan.forecasts}
-        units, is_least = 0, False
+        units, is_open, may_follow = 0, False, False
         for stage in plan.stages:
             own = {(identities[stage.name], item) for item in (*stage.run, *stage.may_run)}
             if stage.open and (whole := (identities[stage.name], "…")) not in seen:
                 seen.add(whole)
-                count = expected.get(stage.name)
-                is_least |= count is None
-                units += max(0, (count or 0) - len(own))
+                is_open = True
+                units += max(0, (expected.get(stage.name) or 0) - len(own))
             units += len(own - seen)
+            may_follow |= any((identities[stage.name], item) not in seen for item in stage.may_run)
             seen |= own
-        found.append(PlannedUnits(run, units, sum(len(stage.cached) for stage in plan.stages), is_least))
+        bound: Literal["", "up to", "about"] = "about" if is_open else "up to" if may_follow else ""
+        found.append(PlannedUnits(run, units, sum(len(stage.cached) for stage in plan.stages), bound))
     return found
 
 

@@ -20,10 +20,10 @@ from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.endings import ending_text, guarded
 from pano_mvs.cli.options import CacheOption, UntilOption, WorkflowArgument, takes_record
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import one_line, plural
 
 if TYPE_CHECKING:
-    from pano_mvs.session.progress import Progress
+    from pano_mvs.session.progress import Event, Progress
     from pano_mvs_experiments.vary import Experiment, PlannedRun, VaryRequest
     from pano_mvs_experiments.vary_results import Variation, VariedRun
 
@@ -191,13 +191,13 @@ def _print_plan(experiment: Experiment, console: Console) -> None:
     for each in planned:
         combination = experiment.combinations[each.run.combination]
         values = [combination[target].shown if target in combination else "" for target in experiment.varied]
-        least = "at least " if each.is_least else ""
-        cells = [each.run.capture, *values, str(each.run.seed), str(each.cached), f"{least}{each.units}"]
+        cells = [each.run.capture, *values, str(each.run.seed), str(each.cached), each.shown]
         table.add_row(*map(escape, cells))
     console.print(table)
     total = sum(each.units for each in planned)
-    least = "at least " if any(each.is_least for each in planned) else ""
-    console.say(f"{least}{total} {plural(total, 'unit')} to compute; a unit that several runs need is counted once")
+    bounds = {each.bound for each in planned}
+    bound = "about " if "about" in bounds else "up to " if "up to" in bounds else ""
+    console.say(f"{bound}{total} {plural(total, 'unit')} to compute; a unit that several runs need is counted once")
 
 
 @contextmanager
@@ -205,8 +205,22 @@ def _around(console: Console, total: int, number: int, run: PlannedRun) -> Itera
     from pano_mvs.cli.run.progress import ProgressDisplay
 
     console.say(f"\\[{number}/{total}] {escape(run.label)}")
+    if not console.is_terminal:
+        yield partial(_print_event, console)
+        return
     with ProgressDisplay(console) as bars:
         yield bars
+
+
+def _print_event(console: Console, event: Event) -> None:
+    """Print what fails; the counts follow at the end of the run."""
+    from pano_mvs.session.progress import UnitFailed, Warned
+
+    if isinstance(event, Warned):
+        console.say(f"  [yellow]warning:[/] {escape(event.text)}")
+    elif isinstance(event, UnitFailed):
+        label = f"{event.stage}:{event.item}" if event.item else event.stage
+        console.say(f"  [red]failed:[/] {escape(one_line(label))}: {escape(event.cause)}")
 
 
 def _print_end(console: Console, run: VariedRun) -> None:
