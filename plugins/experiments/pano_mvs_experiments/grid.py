@@ -186,7 +186,7 @@ def combinations_from_file(path: Path) -> list[dict[str, Value]]:
         text = read_regular(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"--vary {path}: cannot be read ({reason_of(error)}). Give a YAML file with grid, list or random"
+            f"{path}: cannot be read ({reason_of(error)}). Give a YAML file with grid, list or random"
         ) from error
     return combinations_from_yaml(parse_yaml(text, str(path)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.results.figures import figure, median
+from pano_mvs.results.figures import figure, median, significant
 from pano_mvs.results.records import UnitCounts
 from pano_mvs.results.summary import FAILED_ITEMS, RunSummary
 
@@ -23,7 +24,7 @@ METRICS = {
     "completeness": "mean share of the pixels of a view that have a range",
     "confirmed": "mean share of the pixels of a view on which other views agree",
     "points": "number of points of the cloud",
-    "seconds": "computing time of all units, as they were measured, also of those that were cached",
+    "seconds": "computing time of all units, also of those that were cached, from their measured times",
 }
 """Figures of a run beside those of its stages."""
 
@@ -63,7 +64,7 @@ class Average:
 
     def __str__(self) -> str:
         """Return the mean and the deviation as text."""
-        return figure(self.mean) + (f" ± {figure(self.deviation)}" if self.deviation else "")
+        return figure(self.mean) + (f" ± {significant(self.deviation)}" if self.deviation else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,7 @@ def metrics_of(summary: RunSummary, seconds: float | None) -> dict[str, float]:
             for score, value in scores.poses.items()
             if isinstance(value, int | float) and not isinstance(value, bool)
         }
-    return {name: float(value) for name, value in own.items() if value is not None}
+    return {name: float(value) for name, value in own.items() if value is not None and math.isfinite(value)}
 
 
 def _scoring_stage(summary: RunSummary) -> str:

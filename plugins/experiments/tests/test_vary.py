@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pano_mvs_experiments import vary as module
+from pano_mvs_experiments.vary import Experiment, variation_of
 from pano_mvs_experiments.vary_results import (
+    METRICS,
     Average,
     Best,
     CombinationResult,
@@ -32,6 +35,7 @@ from pano_mvs.core.errors import UsageError, WorkflowError
 from pano_mvs.results.records import UnitCounts
 from pano_mvs.session.progress import Event, RunFinished
 from tests.cli.conftest import Command, Outcome
+from tests.docs.pages import block, text_of
 from tests.engine.conftest import PATIENCE_S, Toy, finished_records, heed_interrupts
 
 
@@ -415,3 +419,45 @@ def test_errors_and_times_are_best_if_they_are_small() -> None:
     assert direction_of("filters.completeness") == ("filters.completeness", "max")
     assert direction_of("scores.w_mae:max") == ("scores.w_mae", "max")
     assert Counter(direction_of(f"a.{name}")[1] for name in ("median_pair_error_deg", "ause", "abs_rel")) == {"min": 3}
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The page of the documentation, in a folder with the captures that it names."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("photos/lobby", "photos/flat", "photos/house"):
+        Path(name).mkdir(parents=True)
+    return text_of("experiments.md")
+
+
+def test_the_python_on_the_page_prints_the_averages(
+    page: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def pretend(experiment: Experiment, *_: object, **__: object) -> Variation:
+        runs = [
+            VariedRun(run.capture, run.combination, run.seed, run.session.out, 0, metrics={"confirmed": float(idx)})
+            for idx, run in enumerate(experiment.runs)
+        ]
+        return variation_of(experiment, runs)
+
+    monkeypatch.setattr(module, "run_experiment", pretend)
+    exec(block("experiments.md", "vary"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "planes=16,cost=census 7.0"
+    assert printed[-1].startswith("best by confirmed (largest): planes=48,cost=zncc with 16")
+
+
+def test_the_files_on_the_page_can_be_used(page: str, pano_mvs: Command) -> None:
+    found = re.findall(r"<!-- combinations -->\n```yaml\n(.*?)```", page, re.DOTALL)
+    assert len(found) == 2
+    for text in found:
+        Path("v.yaml").write_text(text)
+        Path("photos").mkdir()
+        done = pano_mvs("vary", "quickstart", "--vary", "v.yaml", "--until", "images", "--dry-run")
+        assert done.code == 0, done.text
+        Path("photos").rmdir()
+    assert "20 combinations" in done.text
+
+
+def test_the_page_names_all_metrics(page: str) -> None:
+    assert all(f"| `{name}` | {meaning}" in page for name, meaning in METRICS.items())
