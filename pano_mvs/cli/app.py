@@ -21,7 +21,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache_commands import cache_app
-from pano_mvs.cli.commands import PluginGroup, load_files, takes_options
+from pano_mvs.cli.commands import PluginGroup, options_of_runs, takes_options
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.endings import guarded
@@ -40,7 +40,6 @@ from pano_mvs.cli.options import (
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
-from pano_mvs.core.doors import RunOption
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
@@ -161,17 +160,8 @@ class RunArguments:
     ] = None
 
 
-def _plugin_options() -> dict[str, RunOption]:
-    """Return the options that executors and observers add to `pano-mvs run`."""
-    from pano_mvs.engine.executors.choose import executor_options
-    from pano_mvs.session.observers import observer_options
-
-    load_files()
-    return {**executor_options(), **observer_options()}
-
-
 @app.command()
-@takes_options(_plugin_options)
+@takes_options(options_of_runs)
 @guarded
 @takes_record
 def run(given: RunArguments, options: Mapping[str, tuple[str, ...]] | None = None) -> None:

@@ -97,7 +97,10 @@ class PluginGroup(TyperGroup):
         if "." in cmd_name or full not in COMMANDS.names():
             return _unusable(_missing(full, broken), cmd_name) if broken else None
         try:
-            return _command(COMMANDS.get(full), cmd_name)
+            command = COMMANDS.get(full)
+            made = _command(command, cmd_name)
+            options = None if isinstance(command, typer.Typer) else getattr(command, _OPTIONS, None)
+            return made if options is None or self._describes else _extended(made, options())
         except PluginError as error:
             return _unusable(error, cmd_name)
         except Exception as error:  # typer refuses some annotations
@@ -177,6 +180,8 @@ _OPTIONS = "__pano_mvs_options__"
 def takes_options(options: Callable[[], Mapping[str, RunOption]]) -> Decorator:
     """Return a decorator of a command that takes options of plugins, too: as argument `options`, name to values.
 
+    The command takes its own options as a record, by `pano_mvs.cli.options.takes_record`.
+
     Args:
         options: returns the options by name; it is called when the command is run or described.
     """
@@ -193,6 +198,15 @@ def _extended(own: Any, options: Mapping[str, RunOption]) -> Any:
     taken = {"-h", "--help", *(text for parameter in own.params for text in parameter.opts)}
     added = {name: option for name, option in options.items() if f"--{name}" not in taken}
     return _command(_with_options(own.callback.__wrapped__, added), own.name)
+
+
+def options_of_runs() -> dict[str, RunOption]:
+    """Return the options that executors and observers add to `pano-mvs run` and to what runs workflows, by name."""
+    from pano_mvs.engine.executors.choose import executor_options
+    from pano_mvs.session.observers import observer_options
+
+    load_files()
+    return {**executor_options(), **observer_options()}
 
 
 def _with_options(command: Callable[..., None], options: Mapping[str, RunOption]) -> Callable[..., None]:

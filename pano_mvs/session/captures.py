@@ -17,6 +17,7 @@ from pano_mvs.session.merging.block_runs import (
     BlockRun,
     Division,
     block_runs,
+    decide_blocks,
     decision_of,
     divided,
     earlier_division,
@@ -109,9 +110,32 @@ def run(
     execution = replace(execution, workers=workers or execution.workers)
     poses = None if block_poses is None else Path(block_poses)
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=poses)
-    progress = progress or ignore
     wanted = {name: tuple(values) for name, values in (observers or {}).items()}
-    with observing(wanted, session.out) as observed:
+    return run_open_session(session, execution, decision, observers=wanted, progress=progress or ignore)
+
+
+def run_open_session(
+    session: Session,
+    execution: Execution,
+    decision: BlockDecision | None = None,
+    *,
+    observers: Mapping[str, tuple[str, ...]],
+    progress: Progress = ignore,
+) -> RunOutput:
+    """Run an open session over its capture, in blocks if that was decided, and return its output; see `run`.
+
+    Args:
+        decision: whether to run in blocks; None for blocks if pairs or poses would take more memory than there is.
+        observers: name of each observer that receives the events, to the values of its option, () for a flag.
+
+    Raises:
+        UsageError: if the session cannot be run with this execution or these observers.
+        InputError: if the images cannot be read.
+        StoreError: if the cache or the output folder cannot be written.
+    """
+    if decision is None:
+        decision = decide_blocks(session, execution)
+    with observing(observers, session.out) as observed:
         execution = replace(execution, observers=observed)
         if decision.division is not None:
             return run_in_blocks(session, execution, decision, progress=progress)

@@ -15,8 +15,10 @@ Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
 _SETTING = re.compile(r"(?<![^\s(])--set ([^\s=:]+)")
-_WITH_VALUE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|until|only|refresh|block-\w+) (?=\S)")
-_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|workers|block-\w+)\b")
+_WITH_VALUE = re.compile(
+    r"(?<![^\s(])--(images|out|cache|executor|queue|until|only|refresh|seeds|metric|best|block-\w+) (?=\S)"
+)
+_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|workers|seeds|block-\w+)\b")
 _MIN_FREE = re.compile(r"(?<![^\s(])--min-free\b")  # not an argument
 
 

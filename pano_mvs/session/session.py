@@ -12,7 +12,8 @@ from pathlib import Path
 import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
-from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
+from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS as DEFAULT_OPTIONS  # these are passed on
+from pano_mvs.engine.planning.plan import RunOptions as RunOptions
 from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems

@@ -30,7 +30,7 @@ from tests.synthetic.video_files import tiny_video
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-NO_WORKFLOW = ("<!-- variants -->\n", "<!-- calibration -->\n", "<!-- queue -->\n", "<!-- rooms -->\n")
+NO_WORKFLOW = tuple(f"<!-- {mark} -->\n" for mark in ("variants", "calibration", "queue", "rooms", "combinations"))
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
     "phone",
@@ -176,15 +176,15 @@ def test_every_setting_of_a_command_exists(
 def runnable(arguments: list[str], cache: Path) -> list[str]:
     """Return a command as the test runs it; nothing if it needs more than a few panoramas and some seconds.
 
-    A run ends with its stage `images`. What reads the results of a whole run, opens a window, or needs a scheduler, a
-    queue or pictures of two lenses is left out.
+    A run, and each run of `vary`, ends with its stage `images`. What reads the results of a whole run, opens a window,
+    or needs a scheduler, a queue or pictures of two lenses is left out.
     """
-    if arguments[0] not in ("run", "check", "plan", "status", "stage", "plugins", "schema", "cache"):
+    if arguments[0] not in ("run", "vary", "check", "plan", "status", "stage", "plugins", "schema", "cache"):
         return []
     if {"--scheduler", "--queue", "--only", "--explain", "pin", "images.use=source.dual_fisheye"} & set(arguments):
         return []
     words = [str(cache) if word == "/shared/cache" else word for word in arguments]
-    if words[0] == "run":
+    if words[0] in ("run", "vary"):
         words += [] if "--until" in words else ["--until", "images"]
         words[words.index("--until") + 1] = "images"
     return words
@@ -219,6 +219,7 @@ def test_a_command_of_a_page_is_cut_short_or_left_out(tmp_path: Path) -> None:
     assert runnable(["plan", "fast", "--cache", "/shared/cache"], tmp_path)[-1] == str(tmp_path)
     assert runnable(["run", "fast", "--scheduler", "tcp://host:8786"], tmp_path) == []
     assert runnable(["run", "fast", "--executor", "slurm", "--queue", "slurm.yaml"], tmp_path) == []
+    assert runnable(["vary", "fast", "--set", "depth.planes=1,2"], tmp_path)[-2:] == ["--until", "images"]
     assert runnable(["view", "out/fast"], tmp_path) == []
 
 

@@ -16,6 +16,7 @@ MOST_BYTES = 250_000
 NOTHING_TO_SEE = {
     "architecture.md": "packages and modules",
     "comparison.md": "a table of programs",
+    "experiments.md": "tables of the terminal",
     "faq.md": "questions, answered by links to pages with pictures",
     "glossary.md": "definitions, which link to pages with pictures",
     "installation.md": "commands",

@@ -245,3 +245,31 @@ def test_a_module_that_repeats_a_name_says_both_places(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text + '\n\n@stage("toy.pairs")\ndef more(names: Names[Number]) -> Pairs: ...\n')
     with pytest.raises(PluginError, match=r"'toy.pairs' is defined twice: .*plug\.py:\d+ and .*plug\.py:\d+"):
         Registry().add_file(toy.folder / "plug.py")
+
+
+def test_a_command_of_a_plugin_takes_the_options_of_runs(mine: Path) -> None:
+    (mine / "reveal.py").write_text(
+        """\
+from dataclasses import dataclass
+from typing import Annotated
+
+import typer
+
+from pano_mvs.cli.commands import options_of_runs, register_command, takes_options
+from pano_mvs.cli.options import takes_record
+
+@dataclass(frozen=True)
+class Arguments:
+    name: Annotated[str, typer.Argument()]
+
+@register_command("reveal")
+@takes_options(options_of_runs)
+@takes_record
+def reveal(given: Arguments, options=None) -> None:
+    print(given.name, dict(options))
+"""
+    )
+    assert command("reveal", "x") == (0, "x {}")
+    assert command("reveal", "x", "--otel", "--notify", "u") == (0, "x {'notify': ('u',), 'otel': ()}")
+    assert "--notify" in command("reveal", "--help")[1]
+    assert command("--help")[0] == 0

@@ -120,6 +120,8 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
         both = sorted({*libraries} & {*now["libraries"]})
         pairs = [(name, libraries[name], now["libraries"][name]) for name in both]
         differences.extend(f"{name} {old} → {new}" for name, old, new in pairs if old != new)
+    if before.get("rng_seed", 0) != now.get("rng_seed", 0):
+        differences.append(f"rng_seed {before.get('rng_seed', 0)} → {now.get('rng_seed', 0)}")
     differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
     return "; ".join(differences) or "this version makes its key differently"
 

@@ -404,4 +404,5 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
         "libraries": dict(code.libraries),
         "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
         "kinds": {kind.kind_name(): kind.kind_version for kind in kinds},
+        **({"rng_seed": entry.policy.rng_seed} if entry.policy.rng_seed else {}),
     }

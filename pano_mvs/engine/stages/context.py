@@ -19,8 +19,8 @@ class Context:
     """What a stage receives beside its inputs.
 
     Attributes:
-        rng: random generator, seeded from the stage, the settings and the inputs: a unit draws the same numbers on
-            every machine, also after its code has changed.
+        rng: random generator, seeded from the stage, the settings, the inputs and the key `rng_seed` of the entry: a
+            unit draws the same numbers on every machine, also after its code has changed.
         scratch: an empty folder for files that the stage writes. It is deleted after the unit; files that the stage
             returns are stored before.
         threads: number of threads that the unit may use.

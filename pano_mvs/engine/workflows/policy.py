@@ -53,7 +53,7 @@ class Thresholds(BaseModel):
 
 
 class Policy(BaseModel):
-    """The reserved keys of a stage entry: its inputs, and what happens when units fail."""
+    """The reserved keys of a stage entry: its inputs, and how its units run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -78,6 +78,13 @@ class Policy(BaseModel):
     )
     memory: str | int = Field(
         default=0, description="memory that one unit needs, such as 2GB; only as many units run at a time as fit"
+    )
+    rng_seed: int = Field(
+        default=0,
+        ge=0,
+        le=2**63 - 1,
+        description="another number lets the stage draw other random numbers, to see how much they change the result; "
+        "part of the cache key unless it is 0",
     )
     optional: bool = Field(
         default=False, description="whether the stage is left out, with a warning, if no plugin offers it"

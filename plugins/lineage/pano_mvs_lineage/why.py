@@ -13,10 +13,9 @@ from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import UnitRecord
-from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.results.summary import RUN_JSON
 from pano_mvs.session.running import Execution, run_session
-from pano_mvs.session.session import reopen
+from pano_mvs.session.session import RunOptions, reopen
 from pano_mvs_lineage.diff import digests_in
 from pano_mvs_lineage.stored_runs import StoredRun, find_runs
 

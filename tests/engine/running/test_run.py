@@ -763,3 +763,24 @@ def test_plan_says_what_was_asked_for(finished: Toy) -> None:
     plans = make_plan(workflow, graph, Store(session.store_root), options=options)
     assert {plan.name: plan.run for plan in plans if plan.run} == {"scaled": {"1.txt": "--refresh"}}
     assert plans[-1].name == "mean"
+
+
+def test_another_seed_draws_other_numbers_and_computes_only_what_follows(toy: Toy) -> None:
+    toy.run()
+    text = toy.deliverables()["all.txt"]
+    plan = toy.plan("all.rng_seed=1")
+    assert {name: set(stage.run.values()) for name, stage in plan.items() if stage.run} == {"all": {"rng_seed 0 → 1"}}
+    assert ran(toy.run("all.rng_seed=1")) == {"all": 1}
+    other = toy.deliverables()["all.txt"]
+    assert other.rpartition(b" ")[0] == text.rpartition(b" ")[0]
+    assert other != text
+    assert ran(toy.run()) == {}
+    assert toy.deliverables()["all.txt"] == text
+    assert ran(toy.run("all.rng_seed=1")) == {}
+    assert toy.deliverables()["all.txt"] == other
+
+
+def test_without_a_seed_no_key_changes(toy: Toy) -> None:
+    toy.run()
+    assert not any(stage.run for stage in toy.plan("all.rng_seed=0", "scaled.rng_seed=null").values())
+    assert len(toy.plan("scaled.rng_seed=2")["scaled"].run) == 5

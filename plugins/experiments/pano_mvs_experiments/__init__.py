@@ -1,0 +1,1 @@
+"""Experiments with settings: many runs of a workflow, side by side."""
