@@ -8,8 +8,9 @@ RUN apt-get update \
     && apt-get install --yes --no-install-recommends libegl1 libgl1-mesa-dri libgomp1 \
     && rm -rf /var/lib/apt/lists/*
 
-COPY pyproject.toml README.md LICENSE /src/
+COPY pyproject.toml hatch_build.py README.md LICENSE /src/
 COPY pano_mvs /src/pano_mvs
+COPY plugins /src/plugins
 COPY workflows /src/workflows
 RUN pip install --no-cache-dir '/src[exr,heic]' && rm -rf /src
 
