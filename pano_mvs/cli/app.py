@@ -40,7 +40,6 @@ from pano_mvs.cli.options import (
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
-from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -255,15 +254,21 @@ def plan(
 
 @app.command()
 @guarded
-def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
+def check(
+    workflow: WorkflowArgument,
+    images: ImagesOption = None,
+    overrides: SetOption = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Check again after each change of its files, until Ctrl-C.")
+    ] = False,
+) -> None:
     """Check a workflow and report every mistake with its line and column."""
-    from pano_mvs.session.session import open_session
+    from pano_mvs.cli.check_command import check_workflow, watch_workflow
 
-    session = open_session(workflow, overrides=overrides or [], images=images)
-    for reason in session.workflow.left_out:
-        Console(stderr=True).say(f"[yellow]warning:[/] {escape(reason)}")
-    count = len(session.workflow.stages)
-    Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
+    if watch:
+        watch_workflow(workflow, overrides or [], images)
+    else:
+        check_workflow(workflow, overrides or [], images)
 
 
 @app.command("fmt")

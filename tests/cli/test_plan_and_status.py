@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
+from pano_mvs.cli.check_command import watch_workflow
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.unit_keys import _static_identity
@@ -348,3 +350,28 @@ def test_where_it_cannot_be_written_or_read(pano_mvs: Command) -> None:
     assert pano_mvs("schema", "nothing").code == 2
     Path("bad.yaml").write_text("[")
     assert pano_mvs("schema", "bad.yaml").code == 2
+
+
+def test_a_workflow_is_checked_again_after_each_change_of_its_files(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also of a file that it extends, and of a plugin; a mistake does not end it, and Ctrl-C does."""
+    monkeypatch.chdir(toy.folder)
+    (toy.folder / "child.yaml").write_text("pano_mvs: 1\nextends: wf.yaml\nstages: {scaled: {by: 5}}\n")
+    changes: list[Callable[[], object]] = [
+        lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scael")),
+        lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scael", "use: toy.scale")),
+        lambda: toy.edit("plug.py", lambda text: f"{text}\nraise ValueError('broken')\n"),
+    ]
+
+    def sleep(_seconds: float) -> None:
+        if not changes:
+            raise KeyboardInterrupt
+        changes.pop(0)()
+
+    with pytest.raises(KeyboardInterrupt):
+        watch_workflow("child.yaml", [], None, sleep=sleep)
+    shown = capsys.readouterr()
+    assert shown.out.count("no mistakes") == 2
+    assert "there is no stage 'toy.scael'" in shown.err
+    assert "broken" in shown.err

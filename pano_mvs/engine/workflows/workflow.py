@@ -46,6 +46,7 @@ class Workflow:
     # its plugin files, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()  # why optional stages are missing
+    files: tuple[Path, ...] = ()  # its file, and those that it extends
 
     @property
     def id(self) -> str:
@@ -119,7 +120,8 @@ class WorkflowReader:
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
         below = (f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in files[:-1])
         text = "".join([files[-1].text, *below])
-        return Workflow(name, path, text, stages, tuple(shown), self.plugins, left_out)
+        paths = () if path is None else (*(Path(file.shown_as) for file in files[:-1]), path)
+        return Workflow(name, path, text, stages, tuple(shown), self.plugins, left_out, paths)
 
     def inherited(self, text: str, path: Path) -> dict[str, Located]:
         """Return the stages that a file inherits, and load the plugins of all its files.
