@@ -19,13 +19,13 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
+from pano_mvs_photographs.learned_matches import match_photograph, view_of_photograph
 from quickstart_pictures import IMAGES, ROOT
 
 import pano_mvs
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.learned.aliked import extract_aliked
 from pano_mvs.algorithms.learned.lightglue import match_learned
-from pano_mvs.algorithms.learned.photographs import match_photograph, view_of_photograph
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.geometry import pixel_from_ray, ray_grid

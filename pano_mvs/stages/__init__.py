@@ -24,7 +24,7 @@ from pano_mvs.stages.filters import (
     sky,
     speckle,
 )
-from pano_mvs.stages.fusion import photographs, scale_cloud, vote
+from pano_mvs.stages.fusion import scale_cloud, vote
 from pano_mvs.stages.global_descriptors import vlad
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge
@@ -34,6 +34,5 @@ from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_frame import level, scale, unit_translations
-from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.views import nearest

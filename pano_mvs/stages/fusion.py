@@ -14,8 +14,6 @@ from pydantic import Field
 from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
-from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.api import (
     All,
@@ -30,8 +28,6 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.io.growing_arrays import GrowingArrays
-from pano_mvs.scene.image_file import decode_image
-from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import Structure
 
 
@@ -94,34 +90,6 @@ def scale_cloud(cloud: One[PointCloud], params: ScaleCloudParams, ctx: Context) 
         uncertainty = None if chosen.uncertainty is None else chosen.uncertainty * factor
         clouds[params.group] = replace(chosen, points_in_world=chosen.points_in_world * factor, uncertainty=uncertainty)
     ctx.metric("points", len(cloud))
-    return PointCloud.of_groups(clouds)
-
-
-def colored_memory_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
-    """Return the memory for the cloud's colours and one photograph, of at most 50 megapixels."""
-    return 700_000_000 + 400 * len(inputs["cloud"])
-
-
-@stage("fusion.photographs", settings=PhotographColorSettings, memory=colored_memory_bytes)
-def photographs(cloud: One[PointCloud], photographs: One[Photographs], params: Params, ctx: Context) -> PointCloud:
-    """Colour the cloud by photographs that poses.localise has placed, where they see it.
-
-    The exposure of each photograph is matched with the colours of the cloud. Points that are hidden, or look different
-    in the photograph, keep their colours, as do the points of further groups of poses.
-    """
-    clouds = cloud.groups()
-    if not clouds or not len(photographs):
-        ctx.metric("colored", 0.0)
-        return cloud
-    colors = PhotographColors(clouds[0], settings_from(PhotographColorSettings, params))
-    for idx, name in enumerate(photographs.names):
-        camera = PhotographCamera(
-            photographs.cam_from_world(idx), float(photographs.focals_px[idx]), float(photographs.radials[idx])
-        )
-        if not colors.add(decode_image(photographs.pictures[idx].path), camera):
-            ctx.note(f"{name} shows too little of the cloud to colour it")
-    ctx.metric("colored", colors.colored / max(1, len(clouds[0])))
-    clouds[0] = replace(clouds[0], colors_rgb=colors.colors_rgb())
     return PointCloud.of_groups(clouds)
 
 

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pano_mvs.algorithms.faces.layout import default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import face_source
-from pano_mvs.algorithms.photographs import undistorted_photograph
+from pano_mvs.algorithms.undistortion import undistorted_photograph
 from pano_mvs.api import (
     All,
     Context,

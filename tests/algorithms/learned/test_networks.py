@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.learned import aliked, networks
 from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles, maxima_of_scores
 from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
 from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
-from pano_mvs.algorithms.learned.photographs import match_photograph, view_of_photograph
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import PinholeView, angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
+from pano_mvs.geometry import angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features
 from tests.algorithms.learned.colmap_networks import EXTRACTOR, MATCHER
 
@@ -134,20 +132,6 @@ def test_a_tilted_camera_is_levelled_by_its_zenith(panorama: NDArray[np.uint8], 
     assert right > 0.97
 
 
-def test_a_photograph_matches_where_the_panorama_shows_the_same(panorama: NDArray[np.uint8], found: Features) -> None:
-    """A portrait picture of 300 × 400 pixels, 10° off level, across the seam."""
-    turn = rotation_from_rotvec([0.1, 0.0, 0.17]) @ rotation_from_rotvec([0.0, 3.0, 0.0])
-    view = PinholeView(turn, 300.0, np.array([150.0, 200.0]), (400, 300))
-    photograph = view_of_photograph(sample_view(panorama, view))
-    matches = match_photograph(photograph, found)
-    expected = view.pixels_from_rays(found.bearings[matches[:, 1]])
-    off_px = np.linalg.norm(photograph.pixels_px[matches[:, 0]] - expected, axis=1)
-    assert len(matches) > 50
-    assert np.mean(off_px < 3) > 0.9
-    blank = view_of_photograph(np.zeros((30, 40, 3), np.uint8))
-    assert len(match_photograph(blank, found)) == 0
-
-
 @pytest.mark.slow
 def test_the_record_is_valid_and_leaves_out_masked_pixels(panorama: NDArray[np.uint8], found: Features) -> None:
     found.check()
@@ -219,9 +203,6 @@ def test_files_of_colmap_find_and_match_key_points(panorama: NDArray[np.uint8], 
     off = angle_between(first.bearings[matches[:, 0]] @ new_from_old.T, second.bearings[matches[:, 1]])
     assert len(matches) > 100
     assert np.mean(off < np.deg2rad(0.2)) > 0.9  # half a pixel is 0.06°
-    view = PinholeView(np.eye(3), 256.0, np.array([256.0, 256.0]), (TILE_PX, TILE_PX))
-    photograph = view_of_photograph(sample_view(panorama, view), networks=theirs)
-    assert len(match_photograph(photograph, first, networks=theirs)) > 20
     plain = extract_aliked(np.zeros((*SIZE, 3), np.uint8), mask, ups=[UP], networks=theirs)
     assert match_learned(plain, first, networks=theirs).shape == (0, 2)
 

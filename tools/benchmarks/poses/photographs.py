@@ -22,17 +22,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pano_mvs_photographs.camera import PhotographCamera
+from pano_mvs_photographs.colors import PhotographColors, PhotographColorSettings
+from pano_mvs_photographs.localise_stage import LocaliseParams, localise
 
 from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
-from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, RangeMap
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.stages.poses_localise import LocaliseParams, localise
 from tests.algorithms.fusion.whole import fuse_views
 from tests.stored import write_npz
 from tests.synthetic.colors import colors_along

@@ -11,11 +11,8 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-from pano_mvs.algorithms.features.tangent import extract_sift
-from pano_mvs.algorithms.matching.brute_force import match_l2
-from pano_mvs.algorithms.poses import photograph_panoramas
-from pano_mvs.algorithms.poses.photograph_alignment import (
+from pano_mvs_photographs import panoramas as photograph_panoramas
+from pano_mvs_photographs.alignment import (
     MIN_SIDE_PX,
     PanoramaPatches,
     PhotographPatches,
@@ -23,21 +20,24 @@ from pano_mvs.algorithms.poses.photograph_alignment import (
     photograph_levels,
     sight_points,
 )
-from pano_mvs.algorithms.poses.photograph_camera import (
+from pano_mvs_photographs.camera import (
     FocalPrior,
     PhotographCamera,
     Sightings,
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_panoramas import (
+from pano_mvs_photographs.panoramas import (
     KnownPoints,
     LocatedPanoramas,
     SurfacePoints,
     known_points,
     surface_points,
 )
-from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas as similar_to_each
+from pano_mvs_photographs.panoramas import similar_panoramas as similar_to_each
+
+from pano_mvs.algorithms.features.tangent import extract_sift
+from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, RangeMap

@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import MARGIN, SIZE, aligned_shifts, smoothed_gray, window
-from pano_mvs.algorithms.poses.photograph_camera import (
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.errors import UsageError
+from pano_mvs_photographs.camera import (
     FocalPrior,
     PhotographCamera,
     Sightings,
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_panoramas import SurfacePoints
-from pano_mvs.algorithms.two_view.refinement import tangent_basis
-from pano_mvs.core.arrays import FloatArray
-from pano_mvs.core.errors import UsageError
+from pano_mvs_photographs.panoramas import SurfacePoints
 
 # Levels of the panoramas in each round: coarse patches are aligned from further away.
 _ROUNDS = (1, 0, 0)

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 import pytest
+from pano_mvs_photographs.alignment import PanoramaPatches, PhotographPatches
+from pano_mvs_photographs.localise import Localised, localise_photograph
+from pano_mvs_photographs.panoramas import KnownPoints, has_sift, known_points, surface_points
 
 from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import PhotographKeypoints, extract_orb, extract_sift, photograph_keypoints
-from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
-from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints, has_sift, known_points, surface_points
 from pano_mvs.core.arrays import Picture
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap

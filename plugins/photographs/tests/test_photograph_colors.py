@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pano_mvs_photographs.camera import PhotographCamera
+from pano_mvs_photographs.colors import PhotographColors, PhotographColorSettings
 
 from pano_mvs.algorithms.fusion.fuse import join_clouds
-from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings, undistorted_photograph
-from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
+from pano_mvs.algorithms.undistortion import undistorted_photograph
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pano_mvs_photographs.localise_stage import LocaliseParams, localise, localise_memory_bytes
 from PIL import Image
 from pydantic import ValidationError
 
@@ -15,7 +16,6 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, FilePart, Panorama, Poses, RangeMap
-from pano_mvs.stages.poses_localise import LocaliseParams, localise, localise_memory_bytes
 from pano_mvs.testing.room import default_room, render
 
 SIZE_HW = (192, 384)
@@ -85,7 +85,7 @@ def test_photographs_of_a_large_capture_are_localised_in_blocks(
 ) -> None:
     """Only one of two panoramas is used; `a.png` matches better."""
     poses, features, ranges, images = capture
-    monkeypatch.setattr("pano_mvs.stages.poses_localise._BLOCK", block)
+    monkeypatch.setattr("pano_mvs_photographs.localise_stage._BLOCK", block)
     alone = {"a.png": ranges["a.png"]}
     expected = localise(
         poses, features, alone, images, LocaliseParams(path=folder), Context(np.random.default_rng(0), tmp_path)

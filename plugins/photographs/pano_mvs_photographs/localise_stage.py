@@ -12,10 +12,6 @@ from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.features.tangent import PhotographKeypoints, photograph_keypoints
 from pano_mvs.algorithms.learned.networks import Networks
-from pano_mvs.algorithms.learned.photographs import PhotographView, match_photograph, view_of_photograph
-from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
-from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints, LocatedPanoramas
 from pano_mvs.api import (
     All,
     Context,
@@ -41,6 +37,10 @@ from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.scene.record import FilePart
 from pano_mvs.stages.features import NetworkParams
+from pano_mvs_photographs.alignment import PanoramaPatches, PhotographPatches
+from pano_mvs_photographs.learned_matches import PhotographView, match_photograph, view_of_photograph
+from pano_mvs_photographs.localise import Localised, localise_photograph
+from pano_mvs_photographs.panoramas import KnownPoints, LocatedPanoramas
 
 # Photographs whose panoramas are chosen together: the larger, the less often the panoramas are read.
 _BLOCK = 32

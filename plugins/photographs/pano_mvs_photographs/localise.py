@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.features.tangent import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
-from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
+from pano_mvs_photographs.alignment import Aligned, PhotographPatches
+from pano_mvs_photographs.camera import FocalPrior, PhotographCamera, refine_camera
+from pano_mvs_photographs.panoramas import KnownPoints
 
 _FOV_BOUNDS_DEG = (15.0, 120.0)
 _FEW = 8

@@ -1,0 +1,1 @@
+"""Ordinary photographs among the panoramas: their cameras, and their colours for the cloud."""
