@@ -16,6 +16,7 @@ from rich.markup import escape
 from typer.models import ArgumentInfo
 
 from pano_mvs.cli.console import Console
+from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import PanoMvsError, RunStoppedError, StoreError, WorkflowError
 from pano_mvs.core.memory import require_address_space
 from pano_mvs.core.paths import reason_of
@@ -63,7 +64,12 @@ def guarded(command: Command) -> Command:
                 errors.say(f"[red]error:[/] {escape(problem)}")
                 raise typer.Exit(StoreError.exit_code) from None
             traceback.print_exc()
-            errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")
+            module = command.__module__
+            if module.partition(".")[0] in own_packages():
+                errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")
+            else:
+                place = escape(getattr(sys.modules.get(module), "__file__", None) or module)
+                errors.say(f"[red]error:[/] the command is one of a plugin, {place}, whose code failed; see above")
             raise typer.Exit(1) from None
 
     # Empty paths and arguments are errors: a variable of the shell without a value makes an empty one, and an empty

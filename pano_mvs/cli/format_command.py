@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from pano_mvs.cli.console import Console
 from pano_mvs.core.files import write_given
+from pano_mvs.core.paths import resolved
 from pano_mvs.engine.workflows.formatted import formatted
 from pano_mvs.engine.workflows.workflow_file import read_text
 
@@ -21,10 +22,11 @@ def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, sh
         check: whether to change no file.
         show: whether to print what would change, and to change no file.
     """
+    texts = {path: read_text(path).replace("\r\n", "\n") for path in paths}
+    laid_out = {path: formatted(text, str(path)) for path, text in texts.items()}  # all, before one is written
     changed = []
-    for path in paths:
-        text = read_text(path)
-        made = formatted(text, str(path))
+    for path, made in laid_out.items():
+        text = texts[path]
         if made == text:
             continue
         changed.append(path)
@@ -34,9 +36,17 @@ def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, sh
             )
             console.say(escape("\n".join(lines)))
         elif not check:
-            write_given(path, made, str(path))
+            _write(path, made)
     for path in changed:
         console.say(f"{escape(str(path))}: {'is not laid out as usual' if check or show else 'was laid out'}")
     if not changed:
         console.say(f"{len(paths)} laid out as usual already" if len(paths) > 1 else "laid out as usual already")
     return 4 if changed and (check or show) else 0
+
+
+def _write(path: Path, text: str) -> None:
+    """Replace a file, through links, with the line ends and the permissions that it has."""
+    place = resolved(path)
+    mode, ends = place.stat().st_mode, "\r\n" if b"\r\n" in place.read_bytes() else "\n"
+    write_given(place, text.replace("\n", ends), str(path))
+    place.chmod(mode)

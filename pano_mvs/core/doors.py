@@ -115,6 +115,8 @@ class Door(NamedRegistry[Value]):
 
     def _load(self, name: str) -> Value:
         entries = installed(self.group)[name]
+        # A package cannot take the name of a bundled plugin, just as a file cannot.
+        entries = [entry for entry in entries if is_bundled(entry)] or entries
         if len(entries) > 1:
             both = " and ".join(f"{origin_of(entry)} ({entry.value})" for entry in entries)
             raise PluginError(f"{self.kind} {name!r} is offered twice: by {both}. Uninstall one of them")

@@ -86,8 +86,8 @@ def open_session(
     if images == "":
         raise InputError("--images: the name of the folder is empty. Give the folder that holds the panoramas")
     images = None if images is None else Path(images)
+    registry = Registry.installed()  # whose files may bring readers of captures
     mistake = None if images is None else _images_mistake(images)
-    registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except InvalidWorkflowError as error:

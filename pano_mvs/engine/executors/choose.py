@@ -105,6 +105,7 @@ EXECUTORS = Door[ExecutorKind](
     accepts=lambda value: value if isinstance(value, ExecutorKind) else None,
 )
 VARIABLE = "PANO_MVS_EXECUTOR"
+_EXPECTED = ("name", "capacity", "threads", "cores", "submit", "wait", "cancel", "close")  # of an executor
 
 
 def register_executor(
@@ -177,13 +178,20 @@ def make_executor(store: Store, request: ExecutorRequest = ExecutorRequest()) ->
     """
     kind, request = chosen(request)
     try:
-        return kind.make(store, request)
+        executor = kind.make(store, request)
     except (PanoMvsError, OSError):
         raise
     except Exception as error:
         raise PluginError(
             f"the executor {request.name!r} ({EXECUTORS.origin(request.name)}) cannot start: {error_summary(error)}"
         ) from error
+    missing = [name for name in _EXPECTED if not hasattr(executor, name)]
+    if missing:
+        raise PluginError(
+            f"the executor {request.name!r} ({EXECUTORS.origin(request.name)}) makes an object of "
+            f"{type(executor).__name__}, which has no {', '.join(missing)}: derive it from Executor"
+        )
+    return executor
 
 
 def executor_size(request: ExecutorRequest) -> ExecutorSize:

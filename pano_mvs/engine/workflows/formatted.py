@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -51,8 +52,8 @@ def formatted(text: str, shown_as: str) -> str:
     if not isinstance(value.value, dict) or not isinstance(root, MappingNode):
         raise WorkflowError([f"{shown_as}: a workflow is a mapping with the key stages"])
     lines = text.splitlines()
-    if root.flow_style or _SHARED.search(lines[0] if lines else ""):
-        return text  # one flow mapping, as a program writes it
+    if root.flow_style or root.start_mark.column or any(line.startswith(("---", "...", "%")) for line in lines):
+        return text  # one flow mapping, as a program writes it, an indented one, or one with marks of documents
     entries, rest = _entries(root, lines, end=len(lines))
     entries.sort(key=lambda entry: _TOP.index(entry.key) if entry.key in _TOP else len(_TOP))
     found: list[str] = []
@@ -60,8 +61,8 @@ def formatted(text: str, shown_as: str) -> str:
         found += entry.before
         found += _stages(entry, lines) if entry.key == "stages" else _top(entry)
     made = "\n".join([*found, *rest]).rstrip("\n") + "\n"
-    if parse_yaml(made, shown_as).plain() != value.plain():
-        raise WorkflowError([f"{shown_as}: cannot be laid out without changing what it means; it was left as it is"])
+    if parse_yaml(made, shown_as).plain() != value.plain() or Counter(_comments(made)) != Counter(_comments(text)):
+        raise WorkflowError([f"{shown_as}: cannot be laid out without losing something; it was left as it is"])
     return made
 
 
@@ -189,13 +190,41 @@ def _scalar(text: str) -> str:
 
 
 def _comment_behind(line: str) -> str:
-    """Return the comment at the end of a line, which begins with `#` after a blank outside of quotes; "" if none."""
-    quote = ""
-    for place, sign in enumerate(line):
+    """Return the comment at the end of a line that begins outside of quotes; "" if there is none."""
+    found = _comments(line)
+    return found[-1] if found else ""
+
+
+def _comments(text: str) -> list[str]:
+    """Return the comments of a YAML text, each from its `#` to the end of its line.
+
+    A `#` begins a comment at the beginning of a line or behind a blank, outside of quotes. A quote opens a quoted text
+    where a value may begin: behind a blank or one of `[{,:`, after blanks.
+    """
+    found: list[str] = []
+    place, quote = 0, ""
+    while place < len(text):
+        sign = text[place]
+        if quote == '"' and sign == "\\":
+            place += 2
+            continue
+        if quote == "'" and text[place : place + 2] == "''":
+            place += 2
+            continue
         if quote:
-            quote = "" if sign == quote and not (quote == '"' and line[place - 1] == "\\") else quote
-        elif sign in "'\"" and (not place or line[place - 1] in " \t[{,:"):
+            quote = "" if sign == quote else quote
+        elif sign in "'\"" and _begins_value(text[:place]):
             quote = sign
-        elif sign == "#" and place and line[place - 1] in " \t":
-            return line[place:].rstrip()
-    return ""
+        elif sign == "#" and (not place or text[place - 1] in " \t\n"):
+            end = text.find("\n", place)
+            end = len(text) if end < 0 else end
+            found.append(text[place:end].rstrip())
+            place = end
+        place += 1
+    return found
+
+
+def _begins_value(before: str) -> bool:
+    """Return whether a value may begin behind a text: at the beginning of a line, or behind one of `[{,:-?`."""
+    line = before.rpartition("\n")[2].rstrip(" \t")
+    return not line or line[-1] in "[{,:-?"

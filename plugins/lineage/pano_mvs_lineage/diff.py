@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
 from pano_mvs.geometry import geodesic_angle
 from pano_mvs.geometry.pose_errors import align_centers, camera_extent
@@ -78,7 +79,7 @@ class RunDiff:
 
     @property
     def is_same(self) -> bool:
-        """Whether both runs have the same settings, images, code and files."""
+        """Whether both runs have the same settings, images, code and files, as far as they could be compared."""
         return not (self.stages or self.settings or self.reasons or self.images or self.files or self.outcome)
 
     def to_json(self) -> dict[str, Any]:
@@ -91,7 +92,8 @@ class RunDiff:
     def lines(self) -> list[str]:
         """Return the differences as text, the most telling first."""
         if self.is_same:
-            return ["the same settings, images, code and files", *self.notes]
+            same = "the same settings, images, code and files"
+            return [f"{same}, as far as they could be compared:" if self.notes else same, *self.notes]
         parts: list[tuple[str, list[str]]] = [
             ("outcome", list(map(str, self.outcome))),
             ("stages", list(map(str, self.stages))),
@@ -131,6 +133,7 @@ def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = No
     root = None if cache is None else Path(cache)
     old, new = StoredRun.open(first, root), StoredRun.open(second, root)
     notes = [*old.notes, *(note for note in new.notes if note not in old.notes)]
+    notes += [note for run in (old, new) if (note := _missing_files(run))]
     images = _images(old, new)
     if not {*_named(old)} & {*_named(new)}:
         notes.append("the runs have no image in common, so that poses and ranges are not compared")
@@ -246,6 +249,12 @@ def _named(run: StoredRun) -> dict[str, str]:
 
 def _images(old: StoredRun, new: StoredRun) -> tuple[Change, ...]:
     return _changes(_named(old), _named(new))
+
+
+def _missing_files(run: StoredRun) -> str:
+    """Return a note on delivered files that are no longer there; "" if all are."""
+    gone = [name for name in run.summary.files if not exists(run.out / name)]
+    return f"no longer in {run.out}: {shortened_list(gone, 8)}" if gone else ""
 
 
 def _outcome(run: StoredRun) -> dict[str, Any]:

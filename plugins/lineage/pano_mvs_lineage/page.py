@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.io.images.preview import color_mapped, range_limits
 from pano_mvs.results.pictures import evenly_spaced, picture
 from pano_mvs_lineage.diff import RunDiff
-from pano_mvs_lineage.range_changes import LIMIT, relative_difference
+from pano_mvs_lineage.range_changes import LIMIT, relative_difference, scale_of_view
 from pano_mvs_lineage.stored_runs import StoredRun
 
 _WIDTH, _MOST_BYTES, _MOST_VIEWS = 960, 120_000, 40
@@ -58,6 +58,7 @@ def _pair(name: str, old: StoredRun, new: StoredRun, summary: str) -> ViewPair |
     before, after = old.output.views[name].range_map, new.output.views[name].range_map
     if before is None or after is None:
         return None
+    before = (scale_of_view(name, old, new) * before).astype(np.float32)
     if after.shape != before.shape:
         after = cv2.resize(after, before.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float32)
     limits = range_limits(after)

@@ -113,16 +113,28 @@ def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_], weight: FloatArray
 
 def _common(old: StoredRun, new: StoredRun) -> Iterator[tuple[str, float]]:
     """Yield the views that both runs have, with the factor from the first run's unit of length to the other's."""
-    scale = 1.0
-    one, other = old.output.poses, new.output.poses
-    if one is not None and other is not None:
-        names = [name for name in one.names if name in other.names]
-        try:
-            both = [{name: poses.cameras[name] for name in names} for poses in (one, other)]
-            scale = align_centers(*both).scale
-        except UsageError:  # too few cameras, or all in one place
-            scale = 1.0
-        scale = 1.0 if abs(scale - 1) < 1e-9 else scale
     for name in old.output.views:
         if name in new.output.views:
-            yield name, scale
+            yield name, scale_of_view(name, old, new)
+
+
+def scale_of_view(name: str, old: StoredRun, new: StoredRun) -> float:
+    """Return the factor from the unit of length of a view in one run to that in the other; 1 if it is not known.
+
+    Each group of cameras has a unit of its own: those of the view's groups that both runs have are compared.
+    """
+    one, other = old.output.poses, new.output.poses
+    if one is None or other is None or name not in one.names or name not in other.names:
+        return 1.0
+    groups = [dict(zip(poses.names, poses.groups.tolist(), strict=True)) for poses in (one, other)]
+    common = [
+        image
+        for image in one.names
+        if groups[0][image] == groups[0][name] and groups[1].get(image, -1) == groups[1][name]
+    ]
+    both = [{image: poses.cameras[image] for image in common} for poses in (one, other)]
+    try:
+        scale = align_centers(*both).scale
+    except UsageError:  # too few cameras, or all in one place
+        return 1.0
+    return 1.0 if abs(scale - 1) < 1e-9 else scale

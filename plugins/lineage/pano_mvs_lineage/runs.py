@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.text import finite_or_none, shortened_list
-from pano_mvs_lineage.stored_runs import StoredRun, find_runs
+from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
 
 _SCORES = ("median_pair_error_deg", "registered")
 _PATHS = frozenset({"path", "truth"})  # settings whose folders differ wherever a checkout lies
@@ -82,7 +82,9 @@ class RunTable:
         return stream.getvalue()
 
 
-def runs(folders: Iterable[str | Path] = ("out",), *, metrics: Sequence[str] = (), sort: str = "") -> RunTable:
+def runs(
+    folders: str | Path | Iterable[str | Path] = "out", *, metrics: Sequence[str] = (), sort: str = ""
+) -> RunTable:
     """Return the runs in some folders: what differs in their settings, and what came of it.
 
     >>> import pano_mvs
@@ -99,7 +101,7 @@ def runs(folders: Iterable[str | Path] = ("out",), *, metrics: Sequence[str] = (
     """
     found: list[StoredRun] = []
     skipped: list[str] = []
-    for out in find_runs([Path(folder) for folder in folders]):
+    for out in find_runs(as_paths(folders)):
         try:
             found.append(StoredRun.open(out))
         except InputError as error:  # of an interrupted or newer version
@@ -117,10 +119,12 @@ def runs(folders: Iterable[str | Path] = ("out",), *, metrics: Sequence[str] = (
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the settings of stages that all runs have whose values differ, in their order; paths do not count."""
-    common = [name for name in settings[0] if all(name in each for each in settings)]
-    names = (name for name in common if name.rpartition(".")[2] not in _PATHS)
-    return tuple(name for name in names if len({repr(each[name]) for each in settings}) > 1)
+    """Return the settings that differ between runs which have them, in their order; paths of inputs do not count.
+
+    A run may lack a stage, as a partial run does.
+    """
+    names = dict.fromkeys(name for each in settings for name in each if name.rpartition(".")[2] not in _PATHS)
+    return tuple(name for name in names if len({repr(each[name]) for each in settings if name in each}) > 1)
 
 
 def _row(run: StoredRun, settings: Sequence[str], metrics: Sequence[str]) -> RunRow:

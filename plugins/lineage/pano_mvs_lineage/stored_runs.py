@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import InputError, PanoMvsError, StoreError
-from pano_mvs.core.paths import is_file, is_folder, resolved
+from pano_mvs.core.paths import children, is_file, is_folder, resolved
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
@@ -141,23 +140,38 @@ class StoredRun:
         }
 
 
+def as_paths(folders: str | Path | Iterable[str | Path]) -> list[Path]:
+    """Return one folder, or several, as paths."""
+    return [Path(folders)] if isinstance(folders, str | Path) else [Path(folder) for folder in folders]
+
+
 def find_runs(folders: Iterable[Path]) -> list[Path]:
     """Return the output folders of runs in some folders: these themselves, or those below them, by their names.
+
+    Links to folders are followed; a run that is met twice is listed once.
 
     Raises:
         InputError: if a folder does not exist, or holds no run.
     """
-    found: dict[Path, None] = {}
+    found: dict[Path, Path] = {}
     for folder in folders:
         if not is_folder(folder):
             raise InputError(f"{folder}: there is no such folder. Give an output folder, or a folder of these")
-        before = len(found)
-        for place, folders_below, files in os.walk(folder):
-            folders_below[:] = sorted(
-                name for name in folders_below if name not in _SKIPPED and not name.startswith(".")
-            )
-            if RUN_JSON in files:
-                found[Path(place)] = None
-        if len(found) == before:
+        outs = list(_runs_below(folder, set()))
+        if not outs:
             raise InputError(f"{folder}: there is no run in this folder or below it; each has a {RUN_JSON}")
-    return list(found)
+        for out in outs:
+            found.setdefault(resolved(out), out)
+    return list(found.values())
+
+
+def _runs_below(folder: Path, seen: set[Path]) -> Iterator[Path]:
+    """Yield the folders with a run.json, each place once."""
+    if resolved(folder) in seen:  # a link that leads back
+        return
+    seen.add(resolved(folder))
+    if is_file(folder / RUN_JSON):
+        yield folder
+    for inner in children(folder):
+        if is_folder(inner) and inner.name not in _SKIPPED and not inner.name.startswith("."):
+            yield from _runs_below(inner, seen)

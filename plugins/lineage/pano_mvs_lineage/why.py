@@ -11,13 +11,13 @@ from typing import Any
 
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import is_file
-from pano_mvs.engine.cache.store import UnitRecord
+from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.results.summary import RUN_JSON
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions, reopen
 from pano_mvs_lineage.diff import digests_in
-from pano_mvs_lineage.stored_runs import StoredRun, find_runs
+from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
 
 _BY_THE_RUN = ("run.json", "report.html")
 
@@ -78,7 +78,9 @@ class FileOrigin:
         return [*lines, *self.notes]
 
 
-def why(file: str | Path, *, runs: Iterable[str | Path] = (), cache: str | Path | None = None) -> FileOrigin:
+def why(
+    file: str | Path, *, runs: str | Path | Iterable[str | Path] = (), cache: str | Path | None = None
+) -> FileOrigin:
     """Return where a delivered file comes from: its run, the unit that made it, and all that this depends on.
 
     A file in the output folder of a run is found by its place. One that was copied elsewhere is found by its content
@@ -95,7 +97,7 @@ def why(file: str | Path, *, runs: Iterable[str | Path] = (), cache: str | Path 
     Raises:
         InputError: if the file does not exist, or no run has written it.
     """
-    path = Path(file)
+    path = Path(os.path.normpath(file))  # without `..`, and with links as they are
     if not is_file(path):
         raise InputError(f"{path}: there is no such file. Give a file that a run has written")
     root = None if cache is None else Path(cache)
@@ -110,7 +112,8 @@ def why(file: str | Path, *, runs: Iterable[str | Path] = (), cache: str | Path 
         if not runs:
             raise InputError(f"{path}: the run into {place} has not written this file, or an earlier run has")
     digest = digest_from_file(path)
-    for out in find_runs([Path(folder) for folder in runs or (".",)]):
+    searched = as_paths(runs) if runs else [Path()]
+    for out in find_runs(searched):
         try:
             run = StoredRun.open(out, root)
         except InputError:
@@ -118,8 +121,8 @@ def why(file: str | Path, *, runs: Iterable[str | Path] = (), cache: str | Path 
         for name, own in run.summary.files.items():
             if own == digest:
                 return _origin(path, name, run)
-    searched = ", ".join(map(str, runs)) or "the current folder"
-    raise InputError(f"{path}: no run in {searched} has written a file with this content. Name its folder with --runs")
+    where = ", ".join(map(str, searched)) if runs else "the current folder"
+    raise InputError(f"{path}: no run in {where} has written a file with this content. Name its folder with --runs")
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,12 @@ def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
         output = run_session(
             replace(session, out=Path(folder) / "out", run_options=options), Execution(executor="serial")
         )
-        after = StoredRun.open(Path(folder) / "out", session.store_root).record(unit.stage, unit.item)
+        made = StoredRun.open(Path(folder) / "out", session.store_root)
+        after = made.record(unit.stage, unit.item)
+        history = Store(session.store_root).runs
+        for entry in history.entries():  # of a folder that is about to be deleted
+            if entry.out == str(resolved(made.out)) and not entry.pinned:
+                history.forget(entry)
     if before is None or after is None or before.key != after.key:
         raise UsageError(
             f"{unit.label} cannot be computed again as it was: the workflow, the code or the images have changed since"
