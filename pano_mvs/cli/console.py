@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import rich.console
 from rich.console import ConsoleOptions, RenderableType
 from rich.segment import Segment
 
 from pano_mvs.core.text import shortened, without_controls
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_WIDEST = 10_000  # characters of a table that is not shown on a terminal
 
 
 class Console(rich.console.Console):
@@ -26,6 +32,14 @@ class Console(rich.console.Console):
     def say(self, text: str) -> None:
         """Print text with markup, without wrapping it and without colours of numbers and paths."""
         self.print(text, highlight=False, soft_wrap=True)
+
+    def show(self, table: Table) -> None:
+        """Print a table: as wide as a terminal is, and elsewhere, such as in a file, as wide as its texts need."""
+        if self.is_terminal:
+            self.print(table)
+        else:
+            widest = self.options.update(width=_WIDEST)
+            self.print(table, width=self.measure(table, options=widest).maximum, crop=False)
 
 
 def print_json(values: Mapping[str, object]) -> None:

@@ -97,7 +97,12 @@ class Door(NamedRegistry[Value]):
             return str(file)
         if name in self._builtin:
             return "built in"
-        return " and ".join(origin_of(entry) for entry in installed(self.group).get(name, ()))
+        return " and ".join(map(origin_of, self._entries(name)))
+
+    def _entries(self, name: str) -> Sequence[EntryPoint]:
+        """Return the entry points of a name; a package cannot take that of a bundled plugin, just as a file cannot."""
+        entries = installed(self.group).get(name, ())
+        return [entry for entry in entries if is_bundled(entry)] or entries
 
     def problem(self, name: str) -> str:
         """Return why a name cannot be used; "" if it can."""
@@ -114,9 +119,7 @@ class Door(NamedRegistry[Value]):
         return super().check(name)
 
     def _load(self, name: str) -> Value:
-        entries = installed(self.group)[name]
-        # A package cannot take the name of a bundled plugin, just as a file cannot.
-        entries = [entry for entry in entries if is_bundled(entry)] or entries
+        entries = self._entries(name)
         if len(entries) > 1:
             both = " and ".join(f"{origin_of(entry)} ({entry.value})" for entry in entries)
             raise PluginError(f"{self.kind} {name!r} is offered twice: by {both}. Uninstall one of them")

@@ -84,6 +84,13 @@ def test_a_package_cannot_replace_what_is_built_in(packages: Packages) -> None:
     assert (lamps().get("candle"), lamps().origin("candle")) == ("wax", "built in")
 
 
+def test_a_package_cannot_take_the_name_of_a_bundled_plugin(packages: Packages) -> None:
+    packages.add("pano-mvs", {"lamps": {"desk": "own_lamp:lamp"}}, own_lamp=LAMP)
+    packages.add("shop", {"lamps": {"desk": "desk_lamp:lamp"}}, desk_lamp="1 / 0\n")
+    assert callable(lamps().get("desk"))
+    assert "desk_lamp" not in sys.modules
+
+
 def test_a_bundled_plugin_whose_module_is_missing_disables_its_own_names(packages: Packages) -> None:
     """Whoever deletes the folder of a bundled plugin keeps its entry points until pano-mvs is installed again."""
     packages.add("pano-mvs", {"lamps": {"desk": "pano_mvs_lamps.desk:lamp", "wall": "desk_lamp:lamp"}}, desk_lamp=LAMP)

@@ -180,7 +180,9 @@ def _flow(node: Node) -> str:
     text = str(node.value)
     if node.style in ("'", '"'):
         return _scalar(text)
-    return text if text else "null"
+    if not text:
+        return "null"
+    return text if not set(text) & set(",[]{}") else _scalar(text)  # a plain text with one of these is a string
 
 
 def _scalar(text: str) -> str:

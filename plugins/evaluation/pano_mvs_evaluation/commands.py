@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
+from pano_mvs.cli.commands import load_files
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.endings import guarded
 from pano_mvs.cli.options import takes_record
@@ -44,6 +45,12 @@ _scale_option = partial(typer.Option, rich_help_panel="Scale and units")
 _score_option = partial(typer.Option, rich_help_panel="Scores")
 _mask_option = partial(typer.Option, rich_help_panel="Masks")
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@evaluate_app.callback()
+def with_readers() -> None:
+    """Import the user's plugin files, which may read the poses of the ground truth."""
+    load_files()
 
 
 @evaluate_app.command("run")

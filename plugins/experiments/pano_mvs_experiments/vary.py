@@ -7,6 +7,7 @@ is equal is computed once.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
@@ -14,12 +15,13 @@ from pathlib import Path
 from typing import Literal
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import InputError, PanoMvsError, UsageError, WorkflowError
+from pano_mvs.core.errors import InputError, PanoMvsError, StoreError, UsageError, WorkflowError
 from pano_mvs.core.file_names import plain_title
 from pano_mvs.core.files import OUTPUT_MARK, make_folder, write_text
 from pano_mvs.core.paths import children, exists, is_file, is_folder, reason_of, resolved
 from pano_mvs.core.text import shortened_list
 from pano_mvs.core.yaml_text import did_you_mean
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import executor_size
 from pano_mvs.engine.running.events import ignore
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
@@ -146,7 +148,9 @@ def prepare(request: VaryRequest) -> Experiment:
     experiment = Experiment(
         request, captures, {names[idx]: combinations[idx] for idx in kept}, dropped, tuple(runs), is_repeatable
     )
-    _check_out(request.out, runs[0].session)
+    for session in sessions.values():
+        request.run_options.applied_to(session.workflow, session.graph)
+    _check_out(experiment, runs[0].session)
     for run in runs:
         check_output(run.session)
         _check_run_folder(run.session)
@@ -259,8 +263,9 @@ def _check_metrics(request: VaryRequest, sessions: Sequence[Session]) -> None:
         raise UsageError(f"{place}: no stage {stage[:80]!r}.{did_you_mean(stage, stages)}")
 
 
-def _check_out(out: Path, session: Session) -> None:
-    """Refuse a folder that holds something else than an experiment with the same workflow."""
+def _check_out(experiment: Experiment, session: Session) -> None:
+    """Refuse a folder that holds something else than an experiment with the same workflow and settings."""
+    out = experiment.request.out
     if not exists(out):
         return
     if not is_folder(out):
@@ -276,7 +281,9 @@ def _check_out(out: Path, session: Session) -> None:
         found = json.loads(path.read_bytes())
         name, file = str(found["workflow"]["name"]), str(found["workflow"]["path"])
         is_known = found["schema"] == SCHEMA and isinstance(found["runs"], list)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        varied = [str(one) for one in found["varied"]]
+        captures = {str(key): str(value) for key, value in found["captures"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError(
             f"{path} is not the {VARY_JSON} of an experiment ({reason_of(error)}). Give another --out"
         ) from error
@@ -284,6 +291,20 @@ def _check_out(out: Path, session: Session) -> None:
         raise UsageError(f"{path} was written by another version of pano_mvs. Give another --out")
     if (name, file) != (session.workflow.name, _path_of(session)):
         raise UsageError(f"--out {out}: holds an experiment with another workflow, {name} ({file}). Give another --out")
+    # More settings, other values and more captures continue an experiment; results would be lost in these cases.
+    if not set(varied) <= set(experiment.varied):
+        before, now = (", ".join(one) or "nothing" for one in (varied, experiment.varied))
+        raise UsageError(
+            f"--out {out}: holds an experiment that varies {before}; this one varies {now}. Give another --out"
+        )
+    own = {resolved(one) for one in experiment.captures.values() if one is not None}
+    if lost := [
+        name for name, one in captures.items() if name not in experiment.captures and resolved(Path(one)) not in own
+    ]:
+        raise UsageError(
+            f"--out {out}: holds an experiment over {shortened_list(lost)}, which this one leaves out. "
+            "Give another --out"
+        )
 
 
 def _path_of(session: Session) -> str:
@@ -445,7 +466,7 @@ def _ran(
     except PanoMvsError as error:
         return replace(_not_run(run), exit_code=error.exit_code, stopped=str(error))
     summary = output.summary
-    seconds = None if is_early(summary.exit_code) else _computing_seconds(run.session)
+    seconds = None if is_early(summary.exit_code) else _computing_seconds(run.session, summary)
     return replace(
         _not_run(run),
         exit_code=summary.exit_code,
@@ -456,16 +477,17 @@ def _ran(
     )
 
 
-def _computing_seconds(session: Session) -> float | None:
-    """Return the computing time of all units of a run that has finished, as it was measured; None if unknown."""
+def _computing_seconds(session: Session, summary: RunSummary) -> float | None:
+    """Return the computing time of all units of a run, as each was measured when it was computed; None if unknown."""
+    store = Store(session.store_root, for_reading=True)
+    own = str(resolved(session.out))
     try:
-        plan = plan_session(session)
-    except PanoMvsError:  # such as an image that was removed during the run
+        keys = next((entry.keys for entry in store.runs.entries() if entry.out == own and not entry.pinned), {})
+        records = [store.read_record(key) for units in keys.values() for key in units.values()]
+    except StoreError:  # such as one that is damaged meanwhile
         return None
-    forecasts = [one for one in plan.forecasts if one.cached]
-    if plan.may_follow or not forecasts or any(one.unit_s is None for one in forecasts):
-        return None
-    return sum(one.cached * (one.unit_s or 0.0) for one in forecasts)
+    found = [record.seconds for record in records if record is not None]
+    return math.fsum(found) if found and len(found) == summary.units.run + summary.units.cached else None
 
 
 def variation_of(experiment: Experiment, runs: Sequence[VariedRun]) -> Variation:

@@ -193,7 +193,7 @@ def _print_plan(experiment: Experiment, console: Console) -> None:
         values = [combination[target].shown if target in combination else "" for target in experiment.varied]
         cells = [each.run.capture, *values, str(each.run.seed), str(each.cached), each.shown]
         table.add_row(*map(escape, cells))
-    console.print(table)
+    console.show(table)
     total = sum(each.units for each in planned)
     bounds = {each.bound for each in planned}
     bound = "about " if "about" in bounds else "up to " if "up to" in bounds else ""
@@ -243,7 +243,7 @@ def print_variation(found: Variation, console: Console) -> None:
         cells = ["–" if average is None else _shown(average, len(found.captures)) for average in averages]
         code = "not run" if each.exit_code is None else str(each.exit_code)
         table.add_row(*map(escape, [*values, code, *cells]), style="bold green" if best and each.name == best else "")
-    console.print(table)
+    console.show(table)
     if found.seeds > 1:
         console.say("±: standard deviation over seeds")
     for run in found.runs:

@@ -32,6 +32,7 @@ from pano_mvs_experiments.vary_results import (
 
 import pano_mvs
 from pano_mvs.core.errors import UsageError, WorkflowError
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.results.records import UnitCounts
 from pano_mvs.session.progress import Event, RunFinished
 from tests.cli.conftest import Command, Outcome
@@ -119,12 +120,14 @@ def test_a_list_and_draws_from_a_file(toy: Toy, pano_mvs: Command) -> None:
     assert [each["name"] for each in results(toy)["combinations"]] == ["default", "by=4,retries=2"]
     assert results(toy)["varied"] == ["scaled.by", "mean.retries"]
     file.write_text("random: {count: 3, seed: 1, settings: {scaled.by: {min: 1, max: 9}}}")
+    assert "holds an experiment that varies scaled.by, mean.retries" in vary(pano_mvs, toy, "--vary", file).flat
+    shutil.rmtree(toy.folder / "v")
     assert vary(pano_mvs, toy, "--vary", file).code == 0
     drawn = [each["settings"]["scaled.by"] for each in results(toy)["combinations"]]
     assert len(set(drawn)) == 3
     assert vary(pano_mvs, toy, "--vary", file, "--set", "mean.retries=0,1").code == 0
     assert len(results(toy)["combinations"]) == 6
-    assert "0 units computed" in vary(pano_mvs, toy, "--vary", file).text
+    assert "0 units computed" in vary(pano_mvs, toy, "--vary", file, "--set", "mean.retries=0,1").text
 
 
 def test_settings_that_do_not_vary_are_in_all_runs(toy: Toy, pano_mvs: Command) -> None:
@@ -290,6 +293,38 @@ def test_a_folder_that_holds_something_else_is_refused(toy: Toy, pano_mvs: Comma
     (toy.folder / "other.yaml").write_text("pano_mvs: 1\nextends: wf.yaml\n")
     words = ("vary", toy.folder / "other.yaml", "--out", out, "--cache", toy.folder / "cache", *grid)
     assert "holds an experiment with another workflow, toy" in pano_mvs(*words).flat
+    before = (out / "vary.json").read_bytes()
+    refused = vary(pano_mvs, toy, "--set", "mean.retries=0,1")
+    assert refused.code == 2
+    assert "holds an experiment that varies scaled.by; this one varies mean.retries. Give another --out" in refused.flat
+    assert (out / "vary.json").read_bytes() == before
+
+
+def test_a_folder_over_more_captures_is_refused(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
+    grid = ("--set", "scaled.by=2,3")
+    both = [word for folder in captures for word in ("--images", folder)]
+    assert vary(pano_mvs, toy, *both, *grid).code == 0
+    refused = vary(pano_mvs, toy, "--images", captures[0], *grid)
+    assert refused.code == 2
+    assert re.search("holds an experiment over attic_images, .*_cellar, which this one leaves out", refused.flat)
+
+
+def test_the_time_of_a_run_is_that_of_its_own_units(toy: Toy, pano_mvs: Command) -> None:
+    assert vary(pano_mvs, toy, "--set", "scaled.by=2,3").code == 0
+    store = Store(toy.folder / "cache", for_reading=True)
+    for run in results(toy)["runs"]:
+        out = str((toy.folder / "v" / run["out"]).resolve())
+        entry = next(each for each in store.runs.entries() if each.out == out)
+        records = [store.read_record(key) for units in entry.keys.values() for key in units.values()]
+        expected = sum(record.seconds for record in records if record is not None)
+        assert run["metrics"]["seconds"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_stage_that_is_not_there_is_found_before_the_first_run(toy: Toy, pano_mvs: Command) -> None:
+    done = vary(pano_mvs, toy, "--set", "scaled.by=2,3", "--until", "nothing")
+    assert done.code == 2
+    assert "there is no stage 'nothing'" in done.flat
+    assert not (toy.folder / "v").exists()
 
 
 def test_the_folder_of_another_combination_is_refused(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:

@@ -54,7 +54,7 @@ def runs(
     for row in table.rows:
         cells = table.cells(row)
         shown.add_row(*(escape(cells[column]) for column in columns))
-    console.print(shown)
+    console.show(shown)
     if hidden:
         console.say(f"{hidden} more settings differ; --csv FILE and --json list them")
     for why_not in table.skipped:

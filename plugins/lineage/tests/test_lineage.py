@@ -18,6 +18,7 @@ from pano_mvs_lineage.why import repeat, why
 import pano_mvs as package
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.session.running import Execution, run_session
+from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
 from tests.engine.conftest import Toy
 
@@ -58,6 +59,27 @@ def test_runs_that_cannot_be_read_are_named_and_left_out(two: tuple[Toy, Path, P
     (first / "run.json").write_text("[]")
     with pytest.raises(InputError, match="no run can be read"):
         runs([toy.folder / "runs"])
+
+
+def test_a_run_that_lacks_a_stage_hides_no_setting(two: tuple[Toy, Path, Path]) -> None:
+    toy, _, _ = two
+    session = replace(toy.session(), out=toy.folder / "runs" / "part", run_options=RunOptions(until=("images",)))
+    run_session(session, Execution("serial"))
+    table = runs(toy.folder / "runs")  # one folder is no sequence of letters
+    assert len(table.rows) == 3
+    assert table.settings == ("scaled.by",)
+
+
+def test_links_to_runs_are_followed_and_no_run_is_listed_twice(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    toy, first, second = two
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "one").symlink_to(first)
+    (first / "back").symlink_to(toy.folder / "runs")  # which would never end
+    assert [row.out for row in runs([tmp_path / "linked"]).rows] == [
+        tmp_path / "linked" / "one",
+        tmp_path / "linked" / "one" / "back" / "second",
+    ]
+    assert len(runs([toy.folder / "runs", second, tmp_path / "linked"]).rows) == 2
 
 
 def test_mistakes_in_lists_of_runs_name_what_there_is(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
@@ -104,6 +126,9 @@ def test_equal_runs_are_the_same_and_one_run_is_not_two(toy: Toy) -> None:
     found = diff(first, second)
     assert found.is_same
     assert found.lines() == ["the same settings, images, code and files"]
+    gone = next(iter(package.load(second).summary.files))
+    (second / gone).unlink()
+    assert any(f"no longer in {second}: {gone}" in line for line in diff(first, second).lines())
     with pytest.raises(UsageError, match="are the same folder"):
         diff(first, first)
     with pytest.raises(InputError, match=r"run\.json cannot be read"):

@@ -153,6 +153,14 @@ def test_an_executor_that_cannot_start_says_why(
     assert "internal error" not in result.flat
 
 
+def test_an_object_that_is_no_executor_is_named(toy: Toy, notes: Path, pano_mvs: Command) -> None:
+    text = FILE.format(name="notes").replace("return Noting(store, request)", "return object()")
+    (notes / "notes.py").write_text(text)
+    result = pano_mvs("run", toy.folder / "wf.yaml", "--executor", "notes")
+    assert result.code == 2
+    assert "makes an object of object, which has no name, capacity, threads" in result.flat
+
+
 def test_an_unknown_executor_lists_the_known_ones(notes: Path, tmp_path: Path, pano_mvs: Command) -> None:
     pano_mvs("--help")
     with pytest.raises(UsageError, match=r"there is no executor 'note'; did you mean 'notes'\? known: serial, proc"):

@@ -103,6 +103,32 @@ def test_what_cannot_be_written_anew_stays(text: str) -> None:
     assert formatted(text, "a.yaml") == text
 
 
+@pytest.mark.parametrize(
+    ("value", "comment"),
+    [
+        (r'"C:\\x\\"', "# behind a backslash"),
+        ("a 'b}", "# behind an apostrophe in a plain text"),
+        ("'it''s # 1'", "# behind a doubled quote"),
+        ("'two\n        lines # 2'", "# behind two lines"),
+        ("a#b", "# behind a sign in a plain text"),
+    ],
+)
+def test_no_comment_is_lost_behind_odd_values(value: str, comment: str) -> None:
+    text = f"stages:\n    a:\n        use: x.y\n        text: {value}  {comment}\n    b: {{use: x.z}}\n"
+    try:
+        made = formatted(text, "a.yaml")
+    except WorkflowError as error:
+        assert "without losing something; it was left as it is" in str(error)  # noqa: PT017
+        return
+    assert comment in made
+    assert parse_yaml(made, "").plain() == parse_yaml(text, "").plain()
+
+
+@pytest.mark.parametrize("text", ["---\nstages:\n    a: {use: x.y}\n", "  stages:\n      a: {use: x.y}\n"])
+def test_documents_with_marks_and_indented_ones_stay(text: str) -> None:
+    assert formatted(text, "a.yaml") == text
+
+
 def test_what_is_no_workflow_is_refused_with_its_place() -> None:
     with pytest.raises(WorkflowError, match=r"a\.yaml: a workflow is a mapping"):
         formatted("- 1\n", "a.yaml")
@@ -144,3 +170,22 @@ def test_the_command_writes_checks_and_shows(pano_mvs: Command, tmp_path: Path) 
     assert pano_mvs("fmt", tmp_path / "nowhere.yaml").code == 2
     path.write_text("stages:\n  a: {use: [}\n")
     assert pano_mvs("fmt", path).code == 2
+
+
+def test_line_ends_permissions_and_links_stay(pano_mvs: Command, tmp_path: Path) -> None:
+    path, link = tmp_path / "mine.yaml", tmp_path / "link.yaml"
+    path.write_bytes(MESSY.replace("\n", "\r\n").encode())
+    path.chmod(0o640)
+    link.symlink_to(path)
+    assert pano_mvs("fmt", link).code == 0
+    assert link.is_symlink()
+    assert path.read_bytes() == NEAT.replace("\n", "\r\n").encode()
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert pano_mvs("fmt", path, "--check").code == 0
+
+
+def test_one_file_that_cannot_be_read_leaves_all_as_they_are(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(MESSY)
+    (tmp_path / "b.yaml").write_text("stages:\n  a: {use: [}\n")
+    assert pano_mvs("fmt", tmp_path / "a.yaml", tmp_path / "b.yaml").code == 2
+    assert (tmp_path / "a.yaml").read_text() == MESSY
