@@ -144,8 +144,11 @@ def test_a_new_capture_reader_reads_its_list(pano_mvs: Command, mine: Path, toy:
     assert [stage["units"] for stage in run_json(Path("out/look"))["stages"]] == [2]
 
 
-def test_the_commands_know_readers_of_files_from_the_start(mine: Path, toy: Toy, tmp_path: Path) -> None:
+def test_the_commands_know_readers_of_files_from_the_start(
+    mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each in a process of its own, in which nothing has imported the user's files before."""
+    monkeypatch.chdir(tmp_path)
     written_into(mine, "capture_reader")
     written_into(mine, "pose_reader")
     shutil.copytree(tiny_capture(Variant((32, 64))).folder / "images", "attic")
@@ -207,6 +210,11 @@ def test_the_command_says_how_a_plugin_beside_stages_is_used(pano_mvs: Command) 
         ("filter", "class", "cannot be called 'class'"),
         ("filter", "json", "would hide the Python package"),
         ("filter", "numpy", "would hide the Python package"),
+        ("filter", "median", "filters.median exists already as another filter"),
+        ("command", "run", "run exists already as another command"),
+        ("command", "cache", "cache exists already"),
+        ("executor", "serial", "serial exists already as another executor"),
+        ("observer", "workers", "workers exists already as another observer or option"),
     ],
 )
 def test_what_cannot_be_written_is_refused(pano_mvs: Command, kind: str, name: str, what: str) -> None:

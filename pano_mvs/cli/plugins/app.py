@@ -133,6 +133,7 @@ def _type_name(schema: dict[str, object]) -> str:
 @plugin_app.command("new")
 @guarded
 def plugin_new(
+    context: typer.Context,
     kind: Annotated[
         str,
         typer.Argument(help="Kind of plugin; `pano-mvs plugin kinds` lists them.", autocompletion=complete_plugin_kind),
@@ -143,7 +144,7 @@ def plugin_new(
     """Write a working plugin, NAME.py, and its test, test_NAME.py."""
     from pano_mvs.cli.plugins.new import write_plugin
 
-    write_plugin(kind, name, folder, console=Console())
+    write_plugin(kind, name, folder, commands=context.find_root().command, console=Console())
 
 
 @plugin_app.command("kinds")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.markup import escape
@@ -134,9 +136,16 @@ def _installed() -> frozenset[str]:
     return frozenset(packages_distributions())
 
 
-def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> None:
-    """Write a new plugin and its test into a folder, and print how to use it."""
+def write_plugin(kind: str, name: str, folder: Path, *, commands: Any, console: Console) -> None:
+    """Write a new plugin and its test into a folder, and print how to use it.
+
+    Args:
+        commands: the group of all built-in commands, as typer runs it.
+    """
     plugin, test = rendered(kind, name)
+    if (full := f"{KINDS[kind].prefix}.{name}".removeprefix(".")) in _taken(kind, commands):
+        what = "observer or option" if kind == "observer" else kind.replace("_", " ")
+        raise UsageError(f"{full} exists already as another {what}; nothing was written. Choose another name")
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:
         if exists(path):
@@ -152,6 +161,30 @@ def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> Non
         console.say(f"use it: put {name}.py into a folder that ${PLUGINS_VARIABLE} names, and run")
         console.print(f"  {use}", highlight=False, markup=False, soft_wrap=True)
     console.say(f"test it: pytest {escape(str(paths[1]))}")
+
+
+def _taken(kind: str, built_in: Any) -> Collection[str]:
+    """Return the names that a new plugin of a kind cannot have, because what has them is built in or installed."""
+    from pano_mvs.cli.commands import COMMANDS, options_of_runs
+    from pano_mvs.engine.executors.choose import EXECUTORS
+    from pano_mvs.engine.stages.registry import Registry
+    from pano_mvs.io.readers import CAPTURE_READERS, POSE_READERS
+
+    registry = Registry.installed()  # with the plugins in the user's folders
+    match kind:
+        case "command":
+            return {*built_in.commands, *COMMANDS.names()}
+        case "executor":
+            return EXECUTORS.names()
+        case "observer":
+            options = {text.lstrip("-") for option in built_in.commands["run"].params for text in option.opts}
+            return {*options, *options_of_runs()}
+        case "capture_reader":
+            return CAPTURE_READERS.names()
+        case "pose_reader":
+            return POSE_READERS.names()
+        case _:
+            return {*registry.stages}
 
 
 def show_kinds(console: Console) -> None:
