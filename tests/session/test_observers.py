@@ -298,3 +298,22 @@ def test_an_error_between_blocks_is_the_end_of_the_run(recorders: dict[str, Reco
     with pytest.raises(InputError), observing({"first": ()}, tmp_path) as observed:
         run_blocks(observed)
     assert recorders["first"].seen[-2:] == [RunFinished(2, "the blocks cannot be merged", out=tmp_path), "closed"]
+
+
+def test_files_that_have_changed_are_imported_again_by_the_next_run(mine: Path, toy: Toy) -> None:
+    """As in a notebook, whose kernel goes on: what a file registers, and what the stages of another import."""
+    file = mine / "kinds.py"
+    wanted = {"kinds": (str(toy.folder / "first.json"),)}
+    toy.edit("plug.py", lambda text: text.replace('"value", x.value', '"value", double(x.value)'))
+    file.write_text(FILE.format(name="kinds", then="pass"))
+    first = pano_mvs.run(toy.folder / "wf.yaml", out=toy.folder / "one", executor="serial", observers=wanted)
+    file.write_text(FILE.format(name="kinds", then="pass").replace("[len(values), ", '["changed", '))
+    toy.edit("helper.py", lambda text: f"{text}\n\ndef double(value):\n    return -2 * value\n")
+    second = pano_mvs.run(toy.folder / "wf.yaml", out=toy.folder / "two", executor="serial", observers=wanted)
+    assert json.loads((toy.folder / "first.json").read_text())[0] == "changed"
+    values = [
+        next(stage.metrics["value"] for stage in run.summary.stages if stage.name == "scaled")
+        for run in (first, second)
+    ]
+    assert values[0]
+    assert values[1] == -values[0]
