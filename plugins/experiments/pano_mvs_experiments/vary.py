@@ -45,9 +45,12 @@ from pano_mvs_experiments.grid import (
     names_of,
 )
 from pano_mvs_experiments.seeds import SEED_KEY, drawing_stages, seed_overrides
+from pano_mvs_experiments.vary_page import vary_page
 from pano_mvs_experiments.vary_results import (
     METRICS,
     SCHEMA,
+    Best,
+    CaptureResult,
     CombinationResult,
     Variation,
     VariedRun,
@@ -58,8 +61,8 @@ from pano_mvs_experiments.vary_results import (
     metrics_of,
 )
 
-VARY_JSON, VARY_CSV = "vary.json", "vary.csv"
-_OWN_FILES = {VARY_JSON, VARY_CSV, OUTPUT_MARK, LOCK_NAME}
+VARY_JSON, VARY_CSV, VARY_HTML = "vary.json", "vary.csv", "vary.html"
+_OWN_FILES = {VARY_JSON, VARY_CSV, VARY_HTML, OUTPUT_MARK, LOCK_NAME}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -421,7 +424,7 @@ def run_experiment(
     observers: Mapping[str, tuple[str, ...]],
     stop: bool = False,
 ) -> Variation:
-    """Run an experiment, write vary.json and vary.csv after each run, and return the results.
+    """Run an experiment, write vary.json, vary.csv and vary.html after each run, and return the results.
 
     Args:
         stop: whether the first run that does not finish is the last.
@@ -496,20 +499,12 @@ def variation_of(experiment: Experiment, runs: Sequence[VariedRun]) -> Variation
     metrics = tuple(request.metrics) or default_metrics(runs)
     if request.best:
         metrics = tuple(dict.fromkeys([*metrics, direction_of(request.best)[0]]))
-    combinations = []
-    for name, combination in experiment.combinations.items():
-        own = [run for run in runs if run.combination == name]
-        codes = [run.exit_code for run in own if run.exit_code is not None]
-        settings = {target: value.shown for target, value in combination.items()}
-        combinations.append(CombinationResult(name, settings, max(codes, default=None), averages_of(own, metrics)))
-    best = None
-    if request.best:
-        best = best_of(
-            combinations,
-            request.best,
-            captures=len(experiment.captures),
-            is_repeatable=experiment.is_repeatable,
-        )
+    combinations = _results(experiment, runs, metrics)
+    several = list(experiment.captures) if len(experiment.captures) > 1 else []
+    by_capture = {}
+    for capture in several:
+        own = _results(experiment, [run for run in runs if run.capture == capture], metrics)
+        by_capture[capture] = CaptureResult(own, _best(experiment, own, captures=1))
     return Variation(
         out=request.out,
         workflow=session.workflow.name,
@@ -520,16 +515,38 @@ def variation_of(experiment: Experiment, runs: Sequence[VariedRun]) -> Variation
         seeds=request.seeds,
         dropped=experiment.dropped,
         metrics=metrics,
-        combinations=tuple(combinations),
+        combinations=combinations,
         runs=tuple(runs),
-        best=best,
+        best=_best(experiment, combinations, captures=len(experiment.captures)),
+        by_capture=by_capture,
     )
+
+
+def _results(
+    experiment: Experiment, runs: Sequence[VariedRun], metrics: Sequence[str]
+) -> tuple[CombinationResult, ...]:
+    """Return what some runs found, for each combination."""
+    found = []
+    for name, combination in experiment.combinations.items():
+        own = [run for run in runs if run.combination == name]
+        codes = [run.exit_code for run in own if run.exit_code is not None]
+        settings = {target: value.shown for target, value in combination.items()}
+        found.append(CombinationResult(name, settings, max(codes, default=None), averages_of(own, metrics)))
+    return tuple(found)
+
+
+def _best(experiment: Experiment, combinations: Sequence[CombinationResult], *, captures: int) -> Best | None:
+    by = experiment.request.best
+    if not by:
+        return None
+    return best_of(combinations, by, captures=captures, is_repeatable=experiment.is_repeatable)
 
 
 def _write(variation: Variation) -> None:
     text = json.dumps(variation.to_json(), indent=1, ensure_ascii=False, allow_nan=False)
     write_text(variation.out / VARY_JSON, f"{text}\n")
     write_text(variation.out / VARY_CSV, variation.to_csv())
+    write_text(variation.out / VARY_HTML, vary_page(variation))
 
 
 def combined(first: Sequence[Combination], second: Sequence[Combination]) -> list[Combination]:

@@ -252,7 +252,12 @@ def print_variation(found: Variation, console: Console) -> None:
             console.say(f"[red]not finished:[/] {escape(label)}: {escape(run.stopped or ending_text(run.exit_code))}")
     if found.best is not None:
         console.say(escape(found.best.text))
-    console.say(f"{found.computed} {plural(found.computed, 'unit')} computed; results in {escape(str(found.out))}")
+    for capture in found.disagreeing:
+        own = found.by_capture[capture].best
+        console.say(f"{escape(capture)} differs: {escape(own.text if own is not None else '')}")
+    console.say(
+        f"{found.computed} {plural(found.computed, 'unit')} computed; results in {escape(str(found.out / 'vary.html'))}"
+    )
 
 
 def _shown(average: object, captures: int) -> str:

@@ -88,6 +88,14 @@ class Best:
 
 
 @dataclass(frozen=True, slots=True)
+class CaptureResult:
+    """What the runs over one capture found."""
+
+    combinations: tuple[CombinationResult, ...]
+    best: Best | None = None  # None unless it was asked for
+
+
+@dataclass(frozen=True, slots=True)
 class Variation:
     """The results of an experiment."""
 
@@ -103,6 +111,15 @@ class Variation:
     combinations: tuple[CombinationResult, ...]
     runs: tuple[VariedRun, ...]
     best: Best | None = None  # None unless it was asked for
+    by_capture: Mapping[str, CaptureResult] = field(default_factory=dict)  # of each capture alone, if there are several
+
+    @property
+    def disagreeing(self) -> tuple[str, ...]:
+        """The captures for which another combination than the best over all captures is the best."""
+        if self.best is None or not self.best.name:
+            return ()
+        own = {name: each.best.name for name, each in self.by_capture.items() if each.best is not None}
+        return tuple(name for name, best in own.items() if best not in ("", self.best.name))
 
     @property
     def computed(self) -> int:
@@ -133,16 +150,15 @@ class Variation:
             "seeds": self.seeds,
             "dropped": dict(self.dropped),
             "metrics": list(self.metrics),
-            "combinations": [
-                {
-                    "name": each.name,
-                    "settings": dict(each.settings),
-                    "exit_code": each.exit_code,
-                    "metrics": {name: asdict(average) for name, average in each.averages.items()},
-                }
-                for each in self.combinations
-            ],
+            "combinations": [{"settings": dict(each.settings)} | _to_json(each) for each in self.combinations],
             "best": None if self.best is None else asdict(self.best),
+            "by_capture": {
+                name: {
+                    "combinations": [_to_json(each) for each in result.combinations],
+                    "best": None if result.best is None else asdict(result.best),
+                }
+                for name, result in self.by_capture.items()
+            },
             "runs": [
                 {
                     "capture": run.capture,
@@ -178,6 +194,11 @@ class Variation:
                 ]
             )
         return stream.getvalue()
+
+
+def _to_json(result: CombinationResult) -> dict[str, Any]:
+    averages = {name: asdict(average) for name, average in result.averages.items()}
+    return {"name": result.name, "exit_code": result.exit_code, "metrics": averages}
 
 
 def metrics_of(summary: RunSummary, seconds: float | None) -> dict[str, float]:

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from pano_mvs_experiments import vary as module
@@ -171,6 +172,42 @@ def test_several_captures(toy: Toy, captures: list[Path], pano_mvs: Command) -> 
     (average, _) = [each["metrics"]["scaled.value"] for each in found["combinations"]]
     assert average == {"mean": pytest.approx(30.2), "deviation": None, "captures": 3}
     assert "given twice" in vary(pano_mvs, toy, *options, *options[:2], "--set", "scaled.by=2,3").flat
+
+
+def test_captures_for_which_another_combination_is_the_best_are_named(
+    toy: Toy, captures: list[Path], pano_mvs: Command
+) -> None:
+    toy.edit("plug.py", lambda text: text.replace('"value", x.value', '"value", (x.value - 30.1) * params.by'))
+    options = [word for folder in captures for word in ("--images", str(folder))]
+    chosen = ("--seeds", "2", "--metric", "mean.value", "--best", "scaled.value")
+    done = vary(pano_mvs, toy, *options, "--set", "scaled.by=2,3", *chosen)
+    assert done.code == 0, done.text
+    found = results(toy)
+    assert found["best"]["name"] == "by=3"
+    bests = {name: each["best"]["name"] for name, each in found["by_capture"].items()}
+    assert [*bests.values()] == ["by=2", "by=3", "by=3"]
+    hall = found["by_capture"]["hall_images"]["combinations"]
+    assert [each["metrics"]["scaled.value"]["mean"] for each in hall] == pytest.approx([-0.2, -0.3])
+    assert "hall_images differs: best by scaled.value (largest): by=2 with -0.2; the next is by=3" in done.flat
+    page = (toy.folder / "v" / "vary.html").read_text()
+    assert "Another combination is the best for hall_images</b>" in page
+    assert page.count('<tr class="best">') == 4
+    addresses = re.findall(r'<a href="([^"]+)">seed [01]</a>', page)
+    assert len(addresses) == 12
+    assert all((toy.folder / "v" / unquote(address)).is_file() for address in addresses)
+    assert not re.search(r'(src|href)="(https?:|/)', page)
+
+
+def test_the_page_of_one_capture_shows_what_is_missing(toy: Toy, pano_mvs: Command) -> None:
+    toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", STOPPING))
+    toy.number("3.txt", "13")  # on which it fails
+    assert vary(pano_mvs, toy, "--set", "scaled.by=2,<3>").code == 2
+    assert vary(pano_mvs, toy, "--set", "scaled.by=2,3", "--stop").code == 3
+    page = (toy.folder / "v" / "vary.html").read_text()
+    assert "1 of 2 runs have ended" in page
+    assert "not run" in page
+    assert "Not finished" in page
+    assert results(toy)["by_capture"] == {}
 
 
 STOPPING = "use: toy.scale, on_error: stop"
