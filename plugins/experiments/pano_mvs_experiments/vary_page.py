@@ -40,6 +40,11 @@ class ResultTable:
     text: str  # which is the best, or why none is; empty if this was not asked for
     rows: tuple[Row, ...]
 
+    @property
+    def has_reports(self) -> bool:
+        """Whether any run of the table has a report."""
+        return any(row.reports for row in self.rows)
+
 
 def vary_page(found: Variation) -> str:
     """Return the page, one file of HTML that needs no network."""
