@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import pano_mvs as pano_mvs_package
 from tests.cli.conftest import SMALL, Command
 
 
@@ -27,6 +28,9 @@ def test_a_grid_of_four_over_a_room(rendered: Path, pano_mvs: Command) -> None:
     assert errors["planes=32,cost=census"] < errors["planes=8,cost=census"]
     for run in found["runs"]:
         assert (Path("v") / run["out"] / "report.html").is_file()
+    # The same name means the same figure in both tables.
+    listed = {row.out.name: row.metrics for row in pano_mvs_package.runs("v", metrics=["scores.w_mae"]).rows}
+    assert {name: row["scores.w_mae"] for name, row in listed.items()} == pytest.approx(errors)
     # The stages up to the poses do not depend on the sweep: they are computed by the first run alone.
     first, *others = found["runs"]
     poses = {

@@ -12,6 +12,7 @@ from typing import Any, TypeGuard
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.text import finite_or_none, shortened_list
+from pano_mvs.results.figures import median
 from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
 
 _SCORES = ("median_pair_error_deg", "registered")
@@ -144,14 +145,14 @@ def _row(run: StoredRun, settings: Sequence[str], metrics: Sequence[str]) -> Run
 
 
 def _values_of(run: StoredRun) -> dict[str, float]:
-    """Return the metrics of a run, and its scores against ground truth."""
+    """Return the metrics of a run, and its scores against ground truth; those of views as the median over them."""
     scores: dict[str, float] = {}
     for stage, each in run.summary.scores_by_stage.items():
         scores |= {f"{stage}.{name}": float(value) for name, value in each.poses.items() if _is_number(value)}
         for name in sorted({name for view in each.views.values() for name in view}):
-            values = [float(value) for view in each.views.values() if _is_number(value := view.get(name))]
-            if values:
-                scores[f"{stage}.{name}"] = sum(values) / len(values)
+            value = median([view.get(name) for view in each.views.values()])
+            if value is not None:
+                scores[f"{stage}.{name}"] = value
     return run.metrics | scores
 
 
