@@ -49,7 +49,7 @@ def files_of(stage: str) -> set[str]:
 @pytest.mark.parametrize(
     ("file", "stages", "others"),
     [
-        ("algorithms/poses/adjustment/kernels_patch_alignment.py", {"poses.refine", "poses.localise"}, {"fusion.vote"}),
+        ("algorithms/poses/adjustment/kernels_patch_alignment.py", {"poses.refine"}, {"fusion.vote"}),
         ("algorithms/features/kernels_sphorb.py", {"features.sphorb"}, {"poses.verify", "depth.sweep"}),
         ("algorithms/sweep/numba/kernels_sgm_rows.py", {"depth.sweep", "poses.verify"}, {"fusion.vote", "export.ply"}),
         ("algorithms/two_view/kernels_five_point.py", {"matches.brute_force"}, {"depth.sweep", "masks.moving"}),
