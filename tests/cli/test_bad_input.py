@@ -141,20 +141,6 @@ def test_outputs_are_no_pictures_of_another_run(
         assert "0 units computed" in pano_mvs(*arguments).text
 
 
-@pytest.mark.parametrize("command", ["check", "plan", "run"])
-def test_a_folder_without_photographs_is_refused_before_anything_is_computed(
-    pano_mvs: Command, tmp_path: Path, capture: Path, command: str
-) -> None:
-    path = tmp_path / "photographs.yaml"
-    path.write_text("pano_mvs: 1\nextends: quality\nstages:\n  photographs: {use: poses.localise, path: phone}\n")
-    (tmp_path / "phone").mkdir()
-    arguments = ("check", path) if command == "check" else (command, path, "--images", capture / "images")
-    result = pano_mvs(*arguments)
-    assert result.code == 2
-    assert "photographs.yaml:4:" in result.flat
-    assert "no photographs here" in result.flat
-
-
 @pytest.mark.skipif(os.name != "posix", reason="names of any bytes exist on POSIX systems only")
 def test_names_that_cannot_be_written_or_look_like_markup(pano_mvs: Command, short: Path, capture: Path) -> None:
     images = capture / "images"

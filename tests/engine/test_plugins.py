@@ -257,6 +257,13 @@ import typer
 
 from pano_mvs.cli.commands import options_of_runs, register_command, takes_options
 from pano_mvs.cli.options import takes_record
+from pano_mvs.session.observers import register_observer
+
+@register_observer("bell", help="Ring.")
+def bell(values, run): ...
+
+@register_observer("letter", help="Write.", metavar="URL")
+def letter(values, run): ...
 
 @dataclass(frozen=True)
 class Arguments:
@@ -270,6 +277,6 @@ def reveal(given: Arguments, options=None) -> None:
 """
     )
     assert command("reveal", "x") == (0, "x {}")
-    assert command("reveal", "x", "--otel", "--notify", "u") == (0, "x {'notify': ('u',), 'otel': ()}")
-    assert "--notify" in command("reveal", "--help")[1]
+    assert command("reveal", "x", "--bell", "--letter", "u") == (0, "x {'bell': (), 'letter': ('u',)}")
+    assert "--letter" in command("reveal", "--help")[1]
     assert command("--help")[0] == 0

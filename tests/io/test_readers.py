@@ -236,7 +236,7 @@ def test_a_file_that_nobody_reads_is_refused(album: Path) -> None:
 
 def test_capture_readers_of_plugins_are_known_by_name(album: Path) -> None:
     Registry.installed()
-    assert {"album", "tour", "video"} <= set(CAPTURE_READERS.names())
+    assert "album" in CAPTURE_READERS.names()
     found = capture_reader_of(album)
     assert found is not None
     assert found.what == "an album"

@@ -8,6 +8,7 @@ import pytest
 
 from tests.cli.conftest import Command, run_json
 from tests.cli.test_compare_sweeps import ALIKE, SAD, write_both
+from tests.report.html_page import Page
 
 
 def test_quickstart_tells_the_accuracy_and_where_the_results_are(quickstart: tuple[Path, str]) -> None:
@@ -15,6 +16,11 @@ def test_quickstart_tells_the_accuracy_and_where_the_results_are(quickstart: tup
     assert "against the ground truth" in text
     assert "PSNR" in text
     assert str(out) in "".join(text.split())
+
+
+def test_the_report_compares_with_the_truth(quickstart: tuple[Path, str]) -> None:
+    page = Page((quickstart[0] / "report.html").read_text(encoding="utf-8"))
+    assert "Comparison with ground truth" in page.words
 
 
 def test_quickstart_recovers_poses_and_ranges(quickstart: tuple[Path, str]) -> None:

@@ -213,8 +213,8 @@ def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
     assert result.code == 0, result.text
     errors = []
     for folder in (quickstart[0], out):
-        views = run_json(folder)["scores"]["views"].values()
-        errors.append(np.mean([view["median_relative_error"] for view in views]))
+        views = range_errors(folder, rendered / "truth").values()
+        errors.append(np.mean([view.median for view in views]))
         assert all(np.isfinite(read_range_tiff(folder / f"range/00{view}.tiff")).mean() > 0.95 for view in range(4))
     assert errors[1] < 0.6 * errors[0]
     assert len(read_ply(out / "cloud.ply")) > 5000
