@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 
 from tests.cli.conftest import capture, finished, finished_once, pano_mvs, quickstart, rendered, sample_cache, toy
-from tests.conftest import pytest_collection_finish
+from tests.conftest import mine, pytest_collection_finish
 
 
 def _is_bundled(project: Path) -> bool:

@@ -144,25 +144,18 @@ def test_a_new_capture_reader_reads_its_list(pano_mvs: Command, mine: Path, toy:
     assert [stage["units"] for stage in run_json(Path("out/look"))["stages"]] == [2]
 
 
-def test_the_commands_know_readers_of_files_from_the_start(
+def test_a_run_knows_readers_of_files_from_the_start(
     mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each in a process of its own, in which nothing has imported the user's files before."""
+    """In a process of its own, in which nothing has imported the user's files before."""
     monkeypatch.chdir(tmp_path)
     written_into(mine, "capture_reader")
-    written_into(mine, "pose_reader")
     shutil.copytree(tiny_capture(Variant((32, 64))).folder / "images", "attic")
     Path("photos.txt").write_text("# mine_capture_reader: one image per line\nattic/001.png\n")
     Path("look.yaml").write_text("pano_mvs: 1\nstages: {images: {use: source.folder, path: photos}}\n")
-    path = tmp_path / "poses.txt"
-    path.write_text(EXAMPLES["pose_reader"].format(name="mine_pose_reader"))
-    for arguments in (
-        ("run", "look.yaml", "--images", "photos.txt", "--executor", "serial"),
-        ("evaluate", "poses", str(path), "--truth", str(path)),
-    ):
-        command = [sys.executable, "-m", "pano_mvs", *arguments]
-        result = subprocess.run(command, capture_output=True, text=True)
-        assert result.returncode == 0, result.stdout + result.stderr
+    command = [sys.executable, "-m", "pano_mvs", "run", "look.yaml", "--images", "photos.txt", "--executor", "serial"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def test_new_plugins_are_clean(written: Path) -> None:
