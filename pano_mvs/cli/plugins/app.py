@@ -47,12 +47,12 @@ def plugins(
 
     console, (registry, _) = Console(), _registry(workflow, files or [])
     problems = entry_problems(check=check)
-    console.print(plugin_table(plugin_rows(registry, problems)))
+    console.show(plugin_table(plugin_rows(registry, problems)))
     table = Table("stage", "version", "from", "")
     for name, spec in sorted(registry.stages.items()):
         doc = spec.doc.splitlines()[0] if spec.doc else ""
         table.add_row(name, str(spec.version), escape(registry.origins[name]), escape(doc))
-    console.print(table)
+    console.show(table)
     for (kind, name), mark in sorted(registry.registrations.items()):
         console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
     for clash in registry.clashes.values():
