@@ -50,7 +50,7 @@ def watch_workflow(
         before = _times(files)
         try:
             files = check_workflow(workflow, overrides, images) or files
-            before |= _times(files)
+            before = _times(files) | {path: before[path] for path in files if path in before}  # as they were checked
         except (WorkflowError, UsageError, InputError) as error:
             _print(error)
         while _times(files) == before:

@@ -35,11 +35,15 @@ class Console(rich.console.Console):
 
     def show(self, table: Table) -> None:
         """Print a table: as wide as a terminal is, and elsewhere, such as in a file, as wide as its texts need."""
+        if self.is_terminal:
+            self.print(table)
+            return
         usual = self.width
-        if not self.is_terminal:
-            self.width = max(usual, self.measure(table, options=self.options.update(width=_WIDEST)).maximum)
-        self.print(table)
-        self.width = usual
+        self.width = max(usual, self.measure(table, options=self.options.update(width=_WIDEST)).maximum)
+        try:
+            self.print(table)
+        finally:
+            self.width = usual
 
 
 def print_json(values: Mapping[str, object]) -> None:

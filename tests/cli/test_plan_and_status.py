@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
@@ -375,3 +376,28 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
     assert shown.out.count("no mistakes") == 2
     assert "there is no stage 'toy.scael'" in shown.err
     assert "broken" in shown.err
+
+
+def test_a_change_during_a_check_is_not_missed(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(toy.folder)
+    changes: list[Callable[[], object]] = [
+        lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scael"))
+    ]
+
+    def changed_meanwhile(*arguments: Any, **settings: Any) -> Session:
+        session = open_session(*arguments, **settings)
+        while changes:
+            changes.pop()()
+        return session
+
+    def sleep(_seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pano_mvs.cli.check_command.open_session", changed_meanwhile)
+    with pytest.raises(KeyboardInterrupt):
+        watch_workflow("wf.yaml", [], None, sleep=sleep)
+    shown = capsys.readouterr()
+    assert shown.out.count("no mistakes") == 1
+    assert "there is no stage 'toy.scael'" in shown.err

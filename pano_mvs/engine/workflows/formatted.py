@@ -201,7 +201,7 @@ def _comments(text: str) -> list[str]:
     """Return the comments of a YAML text, each from its `#` to the end of its line.
 
     A `#` begins a comment at the beginning of a line or behind a blank, outside of quotes. A quote opens a quoted text
-    where a value may begin: behind a blank or one of `[{,:`, after blanks.
+    only where a value may begin.
     """
     found: list[str] = []
     place, quote = 0, ""

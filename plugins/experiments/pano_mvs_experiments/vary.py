@@ -482,9 +482,9 @@ def _ran(
 
 def _computing_seconds(session: Session, summary: RunSummary) -> float | None:
     """Return the computing time of all units of a run, as each was measured when it was computed; None if unknown."""
-    store = Store(session.store_root, for_reading=True)
     own = str(resolved(session.out))
     try:
+        store = Store(session.store_root, for_reading=True)
         keys = next((entry.keys for entry in store.runs.entries() if entry.out == own and not entry.pinned), {})
         records = [store.read_record(key) for units in keys.values() for key in units.values()]
     except StoreError:  # such as one that is damaged meanwhile

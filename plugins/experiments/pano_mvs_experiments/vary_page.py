@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import plural
 from pano_mvs_experiments.vary_results import Best, CaptureResult, CombinationResult, Variation, VariedRun, direction_of
 
 _REPORT = "report.html"
@@ -64,6 +65,14 @@ def vary_page(found: Variation) -> str:
     )
     return environment.get_template("vary.html.j2").render(
         found=found,
+        size=" × ".join(
+            f"{count} {plural(count, what)}"
+            for count, what in (
+                (len(found.combinations), "combination"),
+                (len(found.captures), "capture"),
+                (found.seeds, "seed"),
+            )
+        ),
         headings=found.varied or ("combination",),
         tables=[_table(found, *part) for part in parts],
         failed=[

@@ -135,7 +135,7 @@ def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = No
     notes = [*old.notes, *(note for note in new.notes if note not in old.notes)]
     notes += [note for run in (old, new) if (note := _missing_files(run))]
     images = _images(old, new)
-    if not {*_named(old)} & {*_named(new)}:
+    if not set.intersection(*map(set, _named(old, new))):
         notes.append("the runs have no image in common, so that poses and ranges are not compared")
     poses = _poses(old, new)
     return RunDiff(
@@ -242,13 +242,31 @@ def _common_settings(old: StoredRun, new: StoredRun) -> tuple[dict[str, Any], di
     return before, after
 
 
-def _named(run: StoredRun) -> dict[str, str]:
-    """Return the digest of each image by its name, without the folder."""
-    return {Path(path).name: digest for path, digest in run.summary.inputs.items()}
+def _named(old: StoredRun, new: StoredRun) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the digests of the images of both runs by their names: without folders, unless two of a run are equal.
+
+    With folders, these begin below the one that all images of the run share, which may lie elsewhere for the other.
+    """
+    both = [run.summary.inputs for run in (old, new)]
+    if all(len({Path(path).name for path in inputs}) == len(inputs) for inputs in both):
+        before, after = ({Path(path).name: digest for path, digest in inputs.items()} for inputs in both)
+    else:
+        before, after = (_below_common_folder(inputs) for inputs in both)
+    return before, after
+
+
+def _below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
+    folders = [Path(path).parent for path in inputs]
+    above = [one for first in folders[:1] for one in (first, *first.parents)]
+    shared = next((one for one in above if all(folder.is_relative_to(one) for folder in folders)), Path())
+    return {
+        (Path(path).relative_to(shared) if Path(path).is_relative_to(shared) else Path(path)).as_posix(): digest
+        for path, digest in inputs.items()
+    }
 
 
 def _images(old: StoredRun, new: StoredRun) -> tuple[Change, ...]:
-    return _changes(_named(old), _named(new))
+    return _changes(*_named(old, new))
 
 
 def _missing_files(run: StoredRun) -> str:

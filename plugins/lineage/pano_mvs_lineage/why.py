@@ -149,16 +149,15 @@ def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
     session = reopen(str(origin.out), overrides=[], images=None, cache=None if cache is None else Path(cache))
     before = StoredRun.open(origin.out, session.store_root).record(unit.stage, unit.item)
     with TemporaryDirectory(prefix="pano-mvs-why-") as folder:
-        options = RunOptions(only=(unit.label,), refresh=(unit.label,))
-        output = run_session(
-            replace(session, out=Path(folder) / "out", run_options=options), Execution(executor="serial")
-        )
-        made = StoredRun.open(Path(folder) / "out", session.store_root)
-        after = made.record(unit.stage, unit.item)
-        history = Store(session.store_root).runs
-        for entry in history.entries():  # of a folder that is about to be deleted
-            if entry.out == str(resolved(made.out)) and not entry.pinned:
-                history.forget(entry)
+        out, options = Path(folder) / "out", RunOptions(only=(unit.label,), refresh=(unit.label,))
+        try:
+            output = run_session(replace(session, out=out, run_options=options), Execution(executor="serial"))
+            after = StoredRun.open(out, session.store_root).record(unit.stage, unit.item)
+        finally:
+            history = Store(session.store_root).runs
+            for entry in history.entries():  # of a folder that is about to be deleted
+                if entry.out == str(resolved(out)) and not entry.pinned:
+                    history.forget(entry)
     if before is None or after is None or before.key != after.key:
         raise UsageError(
             f"{unit.label} cannot be computed again as it was: the workflow, the code or the images have changed since"

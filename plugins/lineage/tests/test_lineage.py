@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_lineage.diff import PoseChanges, diff
+from pano_mvs_lineage.diff import Change, PoseChanges, _images, diff
 from pano_mvs_lineage.page import diff_page
 from pano_mvs_lineage.range_changes import compare_ranges
 from pano_mvs_lineage.runs import runs
+from pano_mvs_lineage.stored_runs import StoredRun
 from pano_mvs_lineage.why import repeat, why
 
 import pano_mvs as package
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
@@ -119,6 +121,35 @@ def test_images_and_code_that_differ_are_reasons(toy: Toy) -> None:
     assert [change.name for change in found.images] == ["1.txt"]
     assert "code of toy.scale" in found.reasons["scaled"]
     assert any("other content: 1.txt" in line for line in found.lines())
+
+
+def test_images_of_the_same_name_in_two_folders_are_two(two: tuple[Toy, Path, Path]) -> None:
+    runs_ = [StoredRun.open(out) for out in two[1:]]
+    inputs = ({"/a/c/hall/1.png": "x", "/a/c/attic/1.png": "y"}, {"/b/hall/1.png": "x", "/b/attic/1.png": "z"})
+    old, new = (
+        replace(run, summary=run.summary.model_copy(update={"inputs": own}))
+        for run, own in zip(runs_, inputs, strict=True)
+    )
+    assert _images(old, new) == (Change("attic/1.png", "y", "z"),)
+
+
+def test_a_repetition_that_fails_leaves_no_run_in_the_cache(
+    two: tuple[Toy, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy, first, _ = two
+    origin = why(first / next(iter(package.load(first).summary.files)))
+    kept = {entry.out for entry in Store(toy.folder / "cache").runs.entries()}
+    opened = StoredRun.open
+
+    def fails(out: Path, cache: Path | None = None) -> StoredRun:
+        if out not in two:
+            raise InputError("gone")
+        return opened(out, cache)
+
+    monkeypatch.setattr(StoredRun, "open", fails)
+    with pytest.raises(InputError, match="gone"):
+        repeat(origin)
+    assert {entry.out for entry in Store(toy.folder / "cache").runs.entries()} == kept
 
 
 def test_equal_runs_are_the_same_and_one_run_is_not_two(toy: Toy) -> None:
