@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
 import sys
 from collections.abc import Iterable, Mapping
 from functools import partial
+from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -106,7 +106,9 @@ def answering(monkeypatch: pytest.MonkeyPatch, answers: Mapping[str, object], *,
         return answers.get(name, GOOD[name])
 
     monkeypatch.setattr(libraries, "run_probe", probe)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: object() if torch else None)
+    plugin = ModuleType("pano_mvs_torch")
+    plugin.__spec__ = ModuleSpec("pano_mvs_torch", None)
+    monkeypatch.setitem(sys.modules, "pano_mvs_torch", plugin if torch else None)
 
 
 def test_libraries_that_work_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,7 +93,7 @@ def test_an_exr_keeps_every_bit(tmp_path: Path) -> None:
 
 
 def test_without_openexr_the_remedy_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(ValidationError, match=r"pip install 'pano-mvs\[exr\]'"):
         RangesParams(formats=("tiff", "exr"))
     with pytest.raises(UsageError, match=r"pip install 'pano-mvs\[exr\]'"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,6 @@ def test_too_many_pixels_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_dxf_needs_ezdxf(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "ezdxf", None)
     with pytest.raises(ValueError, match=r"pip install 'pano-mvs\[dxf\]'"):
         FloorPlanParams(formats=("dxf",))
