@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from importlib.metadata import entry_points
 
 from guide_pages import pages_about
 from markdown_text import cell, docstring, table
@@ -11,9 +12,10 @@ from preset_page import presets_that_use
 from pydantic.fields import FieldInfo
 from setting_schema import limits_of, type_of
 
-from pano_mvs import api, stages
+from pano_mvs import api
+from pano_mvs.core.doors import is_bundled
 from pano_mvs.engine.stages.params import NOT_IN_KEY
-from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.registry import ENTRY_POINT_GROUP, Registry
 from pano_mvs.engine.stages.stage import Port, StageSpec
 from pano_mvs.engine.workflows.editor_schema import workflow_schema
 from pano_mvs.engine.workflows.policy import Policy
@@ -42,7 +44,7 @@ KINDS = {
 def stage_page() -> str:
     """Return the page of all stages, by kind in the order of a workflow."""
     kinds: dict[str, list[StageSpec]] = defaultdict(list)
-    for name, spec in sorted(built_in().stages.items()):
+    for name, spec in sorted(shipped().stages.items()):
         kinds[name.partition(".")[0]].append(spec)
     order = [kind for kind in KINDS if kind in kinds] + sorted(kinds.keys() - KINDS.keys())
     rows = [
@@ -58,13 +60,15 @@ def stage_page() -> str:
 
 def schema_text() -> str:
     """Return the JSON Schema of workflow files, as `pano-mvs schema` writes it."""
-    return json.dumps(workflow_schema(built_in()), indent=1, ensure_ascii=False)
+    return json.dumps(workflow_schema(shipped()), indent=1, ensure_ascii=False)
 
 
-def built_in() -> Registry:
-    """Return our own stages, whatever plugins are installed where the site is built."""
+def shipped() -> Registry:
+    """Return our own stages and those of bundled plugins, whatever others are installed where the site is built."""
     registry = Registry()
-    registry.add_module(stages, "pano-mvs")
+    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.value):
+        if is_bundled(entry):
+            registry.add_module(entry.load(), entry.name)
     return registry
 
 

@@ -47,7 +47,7 @@ def section(page: str, title: str) -> str:
 
 
 def test_every_stage_is_described_with_all_its_settings_and_ports(stages: str) -> None:
-    for name, spec in hook("stage_page").built_in().stages.items():
+    for name, spec in hook("stage_page").shipped().stages.items():
         told = section(stages, name)
         assert spec.doc.split()[0] in told
         for setting, info in spec.params_type.model_fields.items():
@@ -58,7 +58,7 @@ def test_every_stage_is_described_with_all_its_settings_and_ports(stages: str) -
 
 def test_every_kind_of_stage_is_introduced() -> None:
     known = hook("stage_page").KINDS
-    assert {name.partition(".")[0] for name in hook("stage_page").built_in().stages} <= known.keys()
+    assert {name.partition(".")[0] for name in hook("stage_page").shipped().stages} <= known.keys()
 
 
 def test_a_stage_names_the_pages_that_tell_of_it(stages: str) -> None:
