@@ -311,15 +311,21 @@ def show(
         bool,
         typer.Option("--resolved", help="Merge all files into one workflow, with every setting and its value."),
     ] = False,
+    text: Annotated[
+        bool, typer.Option("--text", help="Print the workflow and the files that it extends and uses, as they are.")
+    ] = False,
     images: ImagesOption = None,
     overrides: SetOption = None,
-    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="File for the text, or for the result of --resolved.")
+    ] = None,
 ) -> None:
-    """Print a workflow and the files that it extends, or one file with all settings."""
+    """Print the groups of stages of a workflow, its text, or one file with all settings."""
     from pano_mvs.cli.plan_commands import show_workflow
     from pano_mvs.session.session import open_session
 
-    show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
+    session = open_session(workflow, overrides=overrides or [], images=images)
+    show_workflow(session, out, resolved=resolved, text=text)
 
 
 @app.command()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.markup import escape
@@ -18,20 +19,28 @@ from pano_mvs.session.session import open_session, presets_folder
 _INTERVAL_S = 0.5
 
 
-def check_workflow(workflow: str, overrides: Sequence[str], images: Path | None) -> list[Path]:
-    """Check a workflow, print that it has no mistakes, and return its files: YAML files and plugins.
+def check_workflow(
+    workflow: str,
+    overrides: Sequence[str],
+    images: Path | None,
+    *,
+    on_file: Callable[[Path], None] = lambda _: None,
+) -> None:
+    """Check a workflow, and print that it has no mistakes.
+
+    Args:
+        on_file: called with each of its YAML files and plugins before it is read, and with those that are missing.
 
     Raises:
         WorkflowError: with every mistake and its location.
         UsageError: if there is no such workflow.
         InputError: if a file or the images cannot be read.
     """
-    session = open_session(workflow, overrides=overrides, images=images)
-    for reason in session.workflow.left_out:
+    session = open_session(workflow, overrides=overrides, images=images, on_file=on_file)
+    for reason in session.workflow.warnings:
         Console(stderr=True).say(f"[yellow]warning:[/] {escape(reason)}")
     count = len(session.workflow.stages)
     Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
-    return [*session.workflow.files, *session.workflow.plugins]
 
 
 def watch_workflow(
@@ -39,29 +48,36 @@ def watch_workflow(
 ) -> None:
     """Check a workflow now and after each change of its files, until the user interrupts.
 
+    After a check that fails, all files are watched that it has read or missed.
+
     Args:
         sleep: waits between two looks at the files.
 
     Raises:
         UsageError: if there is no such workflow at the beginning.
     """
-    files = [find_workflow(workflow, presets_folder())[0]]
+    first = find_workflow(workflow, presets_folder())[0]
     while True:
-        before = _times(files)
+        checked = {first: _time(first)}
         try:
-            files = check_workflow(workflow, overrides, images) or files
-            before = _times(files) | {path: before[path] for path in files if path in before}  # as they were checked
+            check_workflow(workflow, overrides, images, on_file=partial(_note, checked))
         except (WorkflowError, UsageError, InputError) as error:
             _print(error)
-        while _times(files) == before:
+        while all(_time(path) == before for path, before in checked.items()):
             sleep(_INTERVAL_S)
         Console().say("")
 
 
-def _times(files: Iterable[Path]) -> dict[Path, tuple[int, int] | None]:
-    """Return the time stamp and the size of each file; None for one that is not there."""
-    found = {path: stat_of(path) for path in files}
-    return {path: None if known is None else (known.st_mtime_ns, known.st_size) for path, known in found.items()}
+def _note(checked: dict[Path, tuple[int, int] | None], path: Path) -> None:
+    """Add a file as it is before it is read; one that is read twice stays as it was at first."""
+    if path not in checked:
+        checked[path] = _time(path)
+
+
+def _time(path: Path) -> tuple[int, int] | None:
+    """Return the time stamp and the size of a file; None if it is not there."""
+    known = stat_of(path)
+    return None if known is None else (known.st_mtime_ns, known.st_size)
 
 
 def _print(error: PanoMvsError) -> None:

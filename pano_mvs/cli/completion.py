@@ -16,7 +16,7 @@ from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.paths import children, is_folder
 
 if TYPE_CHECKING:
-    from pano_mvs.engine.workflows.workflow import StageEntry
+    from pano_mvs.engine.workflows.workflow import Workflow
 
 Offer = tuple[str, str]  # what may be put there, and what it is
 
@@ -64,16 +64,19 @@ def complete_stage_kind() -> Iterator[Offer]:
 
 @_silent
 def complete_stage(ctx: typer.Context) -> Iterator[Offer]:
-    """Offer the stages of the workflow on the command line."""
-    for name, entry in _stages(ctx).items():
-        yield name, entry.spec.name
+    """Offer the stages of the workflow on the command line, and its groups of stages."""
+    workflow = _workflow(ctx)
+    if workflow is not None:
+        yield from ((name, entry.spec.name) for name, entry in workflow.stages.items())
+        yield from ((name, group.description or "group of stages") for name, group in workflow.groups.items())
 
 
 @_silent
 def complete_setting(ctx: typer.Context, incomplete: str) -> Iterator[Offer]:
     """Offer STAGE.PARAM= for the workflow on the command line, and after the sign the values of the setting."""
     target, equals, _ = incomplete.partition("=")
-    for name, entry in _stages(ctx).items():
+    workflow = _workflow(ctx)
+    for name, entry in ({} if workflow is None else workflow.stages).items():
         schema = entry.spec.params_type.model_json_schema(by_alias=True) if entry.spec.params_type.model_fields else {}
         for param, field in schema.get("properties", {}).items():
             setting = f"{name}.{param}"
@@ -92,7 +95,7 @@ def complete_plugin_kind() -> Iterator[Offer]:
         yield name, kind.what
 
 
-def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
+def _workflow(ctx: typer.Context) -> Workflow | None:
     from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
     from pano_mvs.session.session import presets_folder
@@ -101,9 +104,9 @@ def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
     known = ctx.params.get("workflow") or ctx.params.get("target")
     named = known or next((word for word in ctx.args if not word.startswith("-")), None)
     if not isinstance(named, str):
-        return {}
+        return None
     path, _ = find_workflow(named, presets_folder())
-    return load_workflow(path, Registry.installed(), presets=presets_folder()).stages
+    return load_workflow(path, Registry.installed(), presets=presets_folder())
 
 
 def _values(field: Mapping[str, Any]) -> Iterator[str]:

@@ -69,8 +69,8 @@ UntilOption = Annotated[
     list[str] | None,
     typer.Option(
         "--until",
-        metavar="STAGE",
-        help="Run only this stage and the stages that it needs.",
+        metavar="STAGE|GROUP",
+        help="Run only this stage, or this group of stages, and the stages that it needs.",
         autocompletion=complete_stage,
     ),
 ]
@@ -85,7 +85,7 @@ RefreshOption = Annotated[
     _unit_option(
         "--refresh",
         metavar="STAGE[:ITEM]",
-        help="Recompute this stage or unit even if it is cached.",
+        help="Recompute this stage, group of stages or unit even if it is cached.",
         autocompletion=complete_stage,
     ),
 ]

@@ -28,7 +28,7 @@ from pano_mvs.engine.planning.units import Unit, UnitInput
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.editor_schema import workflow_schema
 from pano_mvs.engine.workflows.resolved import resolved_yaml
-from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
+from pano_mvs.engine.workflows.workflow import Workflow, WorkflowReader, find_workflow
 from pano_mvs.engine.workflows.workflow_file import read_text
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 from pano_mvs.session.planning import RunPlan, plan_session
@@ -119,6 +119,8 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
 def explain_unit(session: Session, label: str, console: Console) -> None:
     """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit."""
     stage, _, item = label.partition(":")
+    if group := session.workflow.groups.get(stage):
+        raise UsageError(f"{stage} is a group of stages; give a unit of one of them: {', '.join(group.stages)}")
     workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
     store = Store(session.store_root, for_reading=True)
     found: list[tuple[Unit, UnitRecord | None, str]] = []
@@ -237,9 +239,39 @@ def _print_latest(out: Path, console: Console) -> RunSummary | None:
     return latest
 
 
-def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None:
-    """Write the text of a workflow and of the files that it extends, or one file with all settings."""
-    text = resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text
+def show_workflow(session: Session, out: Path | None, *, resolved: bool, text: bool) -> None:
+    """Print the groups of a workflow, or write its YAML.
+
+    Args:
+        out: file to write; None to print.
+        resolved: whether to write one file with all settings.
+        text: whether to write its files as they are; so is what is written to `out`.
+    """
+    if not resolved and not text and out is None:
+        _show_groups(session.workflow, Console())
+        return
+    _write_text(resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text, out)
+
+
+def _show_groups(workflow: Workflow, console: Console) -> None:
+    """Print each group of a workflow with what it does and its stages, and the stages that are in none."""
+    table = Table("group", "what it does", "stages")
+    shown: set[str] = set()
+    for entry in workflow.stages.values():
+        group = workflow.groups.get(entry.group)
+        if group is None:
+            table.add_row("", escape(entry.spec.doc.partition("\n")[0]), escape(entry.name))
+        elif entry.group not in shown:
+            shown.add(entry.group)
+            table.add_row(escape(entry.group), escape(group.description), escape(", ".join(group.stages)))
+    console.show(table)
+    count = len(workflow.stages)
+    console.say(
+        f"{count} {plural(count, 'stage')}; --resolved prints them with all settings, --text the files as they are"
+    )
+
+
+def _write_text(text: str, out: Path | None) -> None:
     text = without_controls(text).rstrip("\n")
     if out is None:
         print(text)
@@ -253,8 +285,8 @@ def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None
 def show_schema(workflow: str | None, out: Path | None) -> None:
     """Write the schema of workflows to a file or to the standard output."""
     registry = Registry.installed()
-    inherited = {} if workflow is None else _inherited(workflow, registry)
-    text = json.dumps(workflow_schema(registry, inherited), indent=1, ensure_ascii=False) + "\n"
+    inherited, groups = ({}, frozenset[str]()) if workflow is None else _inherited(workflow, registry)
+    text = json.dumps(workflow_schema(registry, inherited, groups), indent=1, ensure_ascii=False) + "\n"
     if out is None:
         print(text, end="")
         return
@@ -263,7 +295,7 @@ def show_schema(workflow: str | None, out: Path | None) -> None:
     Console().say(escape(hint))
 
 
-def _inherited(workflow: str, registry: Registry) -> dict[str, Located]:
+def _inherited(workflow: str, registry: Registry) -> tuple[dict[str, Located], frozenset[str]]:
     path, _ = find_workflow(workflow, presets_folder())
     reader = WorkflowReader(str(path), path.parent, registry, presets=presets_folder())
     return reader.inherited(read_text(path), path)

@@ -69,6 +69,7 @@ class StageOutcome(UnitCounts):
 
     name: str = ""  # of the stage in the workflow
     use: str = ""  # the registered stage, such as `depth.sweep`
+    group: str = ""  # the group of stages that it belongs to; empty if it is in none
     version: int = 1  # of the registered stage
     params: Mapping[str, Any] = {}  # its settings, as JSON values
     units: int = 0

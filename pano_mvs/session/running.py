@@ -132,7 +132,7 @@ def _run_and_report(
         )
         with output_lock(session.out):
             log.open(session.out)
-            for reason in session.workflow.left_out:
+            for reason in session.workflow.warnings:
                 observer(Warned(reason))
             if (forecast := forecast_run(run)) is not None:
                 observer(forecast)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -67,6 +67,7 @@ def open_session(
     cache: str | Path | None = None,
     out: str | Path | None = None,
     run_options: RunOptions = DEFAULT_OPTIONS,
+    on_file: Callable[[Path], None] = lambda _: None,
 ) -> Session:
     """Find, validate and wire a workflow.
 
@@ -75,6 +76,7 @@ def open_session(
 
     The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
     preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
+    `on_file` is called with each file of the workflow before it is read, and with those that are missing.
 
     Raises:
         UsageError: if there is no such workflow.
@@ -89,7 +91,9 @@ def open_session(
     registry = Registry.installed()  # whose files may bring readers of captures
     mistake = None if images is None else _images_mistake(images)
     try:
-        workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
+        workflow = load_workflow(
+            path, registry, overrides=overrides, images=images, presets=presets_folder(), on_file=on_file
+        )
     except InvalidWorkflowError as error:
         own = f"--images {images}: "  # said by the mistake already
         found = [*error.problems, *wiring_problems(error.stages, error.unknown)]

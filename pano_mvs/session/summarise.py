@@ -113,6 +113,7 @@ def _stage(summary: StageSummary, workflow: Workflow) -> StageOutcome:
     return StageOutcome(
         **{name: getattr(summary, name) for name in same},
         name=summary.stage,
+        group=entry.group,
         version=entry.spec.version,
         params=entry.params.model_dump(mode="json"),
         seconds=round(summary.seconds, 3),

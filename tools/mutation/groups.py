@@ -53,6 +53,9 @@ GROUPS = {
         ("pano_mvs/engine/cache/store.py", "pano_mvs/engine/cache/blobs.py"),
         _engine("cache/store", "cache/hostile_store", "cache/stat_cache"),
     ),
+    "merged_stages": Group(
+        ("pano_mvs/engine/workflows/merged_stages.py",), _engine("workflows/stage_groups", "workflows/workflow")
+    ),
     "wiring": Group(
         ("pano_mvs/engine/workflows/wiring.py",), _engine("workflows/wiring", "workflows/workflow", "running/run")
     ),

@@ -20,10 +20,10 @@ from pano_mvs.engine.workflows.workflow import Workflow
 class RunOptions:
     """The options of one run."""
 
-    until: tuple[str, ...] = ()  # the run ends after these stages; empty to run all
+    until: tuple[str, ...] = ()  # the run ends after these stages and groups of stages; empty to run all
     # units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
     only: tuple[str, ...] = ()
-    # stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached
+    # stages, groups and units, as `STAGE`, `GROUP` or `STAGE:ITEM`, that are computed again although they are cached
     refresh: tuple[str, ...] = ()
     # reuse results that differ from what is needed only in the code or the libraries that computed them
     accept_code: bool = False
@@ -39,23 +39,31 @@ class RunOptions:
         """Return the workflow and the graph with the options applied.
 
         Raises:
-            UsageError: if an option names a stage that the workflow does not have.
+            UsageError: if an option names a stage or a group that the workflow does not have.
         """
-        for name in (*self.until, *(_stage(unit) for unit in (*self.only, *self.refresh))):
-            if name not in graph.edges:
-                raise UsageError(f"there is no stage {name!r} in this workflow; it has: {', '.join(graph.order)}")
+        for name in (*self.until, *self.refresh, *map(_stage, self.only)):
+            if _stage(name) not in graph.edges and (name not in workflow.groups or name not in self._with_groups):
+                raise UsageError(_unknown_stage(_stage(name), workflow, graph))
         if self.keep_going:
             stages = {
                 name: dataclasses.replace(entry, policy=entry.policy.model_copy(update={"on_error": "skip"}))
                 for name, entry in workflow.stages.items()
             }
             workflow = dataclasses.replace(workflow, stages=stages)
-        ends = {*self.until, *(_stage(unit) for unit in self.only)}
+        until = {stage for name in self.until for stage in stages_named(name, workflow)}
+        ends = until | set(map(_stage, self.only))
         return workflow, graph.limited_to(ends, _items_by_stage(self.only)) if ends else graph
 
     def refreshes(self, unit: Unit) -> bool:
         """Return whether a unit is computed again even if it is cached."""
-        return unit.entry.name in self.refresh or f"{unit.entry.name}:{unit.item}" in self.refresh
+        entry = unit.entry
+        names = (entry.name, f"{entry.name}:{unit.item}", *([entry.group] if entry.group else []))
+        return any(name in self.refresh for name in names)
+
+    @property
+    def _with_groups(self) -> tuple[str, ...]:
+        """What may name a group."""
+        return (*self.until, *self.refresh)
 
     def accepted(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
         """Return what `acceptable` returns, and store it under the new key, so that the next run finds it."""
@@ -75,8 +83,21 @@ class RunOptions:
 DEFAULT_OPTIONS = RunOptions()
 
 
+def stages_named(name: str, workflow: Workflow) -> tuple[str, ...]:
+    """Return the stages that a name stands for: those of a group, or the stage of this name."""
+    group = workflow.groups.get(name)
+    return (name,) if group is None else group.stages
+
+
 def _stage(unit: str) -> str:
     return unit.partition(":")[0]
+
+
+def _unknown_stage(name: str, workflow: Workflow, graph: Graph) -> str:
+    if name in workflow.groups:
+        return f"{name!r} is a group of stages; give one of its stages: {', '.join(workflow.groups[name].stages)}"
+    groups = f"; groups: {', '.join(workflow.groups)}" if workflow.groups else ""
+    return f"there is no stage {name!r} in this workflow; it has: {', '.join(graph.order)}{groups}"
 
 
 def _items_by_stage(units: Iterable[str]) -> Mapping[str, frozenset[str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import quote
 
@@ -19,14 +19,18 @@ _NAME = {"type": "string", "pattern": "^[^\\s/\\\\.:-][^\\s/\\\\:]*$"}
 Schema = dict[str, Any]
 
 
-def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None = None) -> Schema:
-    """Return the schema of workflow files.
+def workflow_schema(
+    registry: Registry, inherited: Mapping[str, Located] | None = None, groups: Collection[str] = ()
+) -> Schema:
+    """Return the schema of workflow files, which is also that of the files of groups.
 
     Args:
-        inherited: the stages of the workflows that a file extends. Their entries in the file may omit `use`, and get
-            the settings of the stage that they use.
+        inherited: the stages of the workflows that a file extends and of its groups. Their entries in the file may omit
+            `use`, and get the settings of the stage that they use.
+        groups: the groups of the workflows that a file extends.
     """
     specs = dict(sorted(registry.stages.items()))
+    known = {name: _inherited(specs, str(node.value["use"].value)) for name, node in (inherited or {}).items()}
     own = Policy.model_json_schema(by_alias=True)
     keys = {
         f"key.{name}": {"description": value.pop("description", ""), "anyOf": [value, {"type": "null"}]}
@@ -39,16 +43,23 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
         "type": "object",
         "required": ["pano_mvs"],
         "additionalProperties": False,
-        "properties": _top(specs, inherited or {}),
-        "if": {"required": ["extends"]},
+        "properties": _top(known | dict.fromkeys(groups, _ref("override"))),
+        "if": {"anyOf": [{"required": ["extends"]}, _has_shared_group()]},
         "then": {"properties": {"stages": {"additionalProperties": _ref("override")}}},
         "else": {
             "required": ["stages"],
-            "properties": {"stages": {"minProperties": 1, "additionalProperties": _ref("stage")}},
+            "properties": {"stages": {"minProperties": 1, "additionalProperties": _ref("stage or group")}},
         },
         "$defs": {
             "stage": _entry(specs),
-            "override": {"anyOf": [{"type": "null"}, _override(specs)]},
+            "group": _group(known),
+            "stage or group": {"if": _is_group(), "then": _ref("group"), "else": _ref("stage")},
+            "override": {
+                "anyOf": [
+                    {"type": "null"},
+                    {"if": _is_group(), "then": _ref("group"), "else": _override(specs)},
+                ]
+            },
             **{f"use.{name}": _settings(spec) for name, spec in specs.items()},
             **keys,
             **own.get("$defs", {}),
@@ -56,8 +67,7 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
     }
 
 
-def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Schema:
-    known = {name: _inherited(specs, str(node.value["use"].value)) for name, node in inherited.items()}
+def _top(known: Schema) -> Schema:
     return {
         "pano_mvs": {"const": FORMAT_VERSION, "description": "version of the workflow format"},
         "name": _NAME | {"description": "name of the output folder; by default that of the file"},
@@ -72,9 +82,40 @@ def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Sc
         },
         "stages": {
             "type": "object",
-            "description": "the stages by name, in order",
+            "description": "the stages by name, in order, and groups of stages",
             "properties": known,
             "propertyNames": _NAME,
+        },
+    }
+
+
+def _is_group() -> Schema:
+    """Return what an entry is that describes a group: an override of a stage may have a setting `group`, a number."""
+    named = {"required": ["group"], "properties": {"group": {"type": ["string", "null"]}}}
+    return {"type": "object", "not": {"required": ["use"]}, "anyOf": [named, {"required": ["stages"]}]}
+
+
+def _has_shared_group() -> Schema:
+    """Return the schema of a file with a group from another file, whose stages its other entries may override."""
+    no_file = {"additionalProperties": {"not": {"type": "object", "required": ["group"]}}}
+    return {"properties": {"stages": {"type": "object", "not": no_file}}, "required": ["stages"]}
+
+
+def _group(known: Schema) -> Schema:
+    """Return the schema of a group: its own stages, or changes of those of its file."""
+    stages = {"type": ["object", "null"], "description": "the stages of the group", "propertyNames": _NAME}
+    return {
+        "type": "object",
+        "description": "a group of stages",
+        "additionalProperties": False,
+        "properties": {
+            "group": {
+                "type": "string",
+                "minLength": 1,
+                "description": "a file with the stages of the group, or a shipped group",
+            },
+            "description": {"type": "string", "description": "what the group does, in a line"},
+            "stages": stages | {"properties": known, "additionalProperties": _ref("override")},
         },
     }
 

@@ -1,7 +1,8 @@
 """Lay out a workflow file: the order of keys, one line for a stage where it fits, no needless quotes, all comments.
 
-Comments stay before the key that they precede, or behind the entry that they follow. An entry with comments inside, or
-with anchors, aliases or tags, stays as it is written.
+Comments stay before the key that they precede, or behind the entry that they follow. A group of stages takes several
+lines unless it has at most one stage. Another entry with comments inside, or with anchors, aliases or tags, stays as it
+is written.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from pano_mvs.core.errors import WorkflowError
 from pano_mvs.core.yaml_text import parse_yaml
+from pano_mvs.engine.workflows.merged_stages import GROUP_KEYS
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 
 WIDTH = 120
-_TOP = ("pano_mvs", "name", "extends", "plugins", "stages")
+_TOP = ("pano_mvs", "name", "description", "extends", "plugins", "stages")
 _MOST_PADDED = 8  # names up to this length, and up to the median one, have their values in one column
 _NOT_PLAIN = re.compile(r"[,\[\]{}#&*!|>'\"%@`]|^[-?:]|: |:$|^\s|\s$|^$|[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _SHARED = re.compile(r"(^|[\s\[{,])[&*!][\w<]")  # an anchor, an alias or a tag
@@ -96,57 +98,122 @@ def _is_root(node: MappingNode) -> bool:
 
 def _top(entry: _Entry) -> Iterator[str]:
     """Yield the lines of a key of the file other than `stages`."""
-    line = f"{entry.key}: {_flow(entry.node)}" + (f"  {entry.behind}" if entry.behind else "")
+    line = f"{entry.key}: {_block(entry.node)}" + (f"  {entry.behind}" if entry.behind else "")
     if _is_plain(entry) and len(line) <= WIDTH and not isinstance(entry.node, MappingNode):
         yield line
     else:
         yield from _written(entry, indent="")
 
 
-def _stages(entry: _Entry, lines: list[str]) -> Iterator[str]:
-    """Yield the lines of the stages, one line each where it fits."""
+def _stages(entry: _Entry, lines: list[str], indent: str = "") -> Iterator[str]:
+    """Yield the lines of the stages, of the file or of a group: one line each where it fits."""
     node = entry.node
     if not isinstance(node, MappingNode) or node.flow_style or not node.value:
-        yield from _written(entry, indent="")
+        yield from _written(entry, indent=indent)
         return
+    start = _line_of(entry, lines)
     first = node.value[0][0].start_mark.line
-    head = [line.strip() for line in lines[node_line(entry, lines) + 1 : first]]
-    last = node_line(entry, lines) + len(entry.lines)
-    found, rest = _entries(node, lines, end=last)
+    head = [line.strip() for line in lines[start + 1 : first]]
+    found, rest = _entries(node, lines, end=start + len(entry.lines))
     lengths = sorted(len(one.key) for one in found)
     most = max(_MOST_PADDED, lengths[len(lengths) // 2])
     padded = max((length for length in lengths if length <= most), default=0) + 2
-    yield "stages:" + (f"  {behind}" if (behind := _comment_behind(entry.lines[0])) else "")
+    yield f"{indent}stages:" + (f"  {behind}" if (behind := _comment_behind(entry.lines[0])) else "")
+    inner = f"{indent}  "
     for line in head:
-        yield f"  {line}".rstrip()
+        yield f"{inner}{line}".rstrip()
     for stage in found:
         for line in stage.before:
-            yield f"  {line}".rstrip()
-        yield from _stage(stage, padded)
+            yield f"{inner}{line}".rstrip()
+        yield from (
+            _group(stage, lines, padded=padded, indent=inner) if _is_long_group(stage) else _stage(stage, padded, inner)
+        )
     for line in rest:
-        yield f"  {line}".rstrip()
+        yield f"{inner}{line}".rstrip()
 
 
-def node_line(entry: _Entry, lines: list[str]) -> int:
+def _is_long_group(entry: _Entry) -> bool:
+    """Return whether an entry is a group in block style whose stages take lines of their own."""
+    if not isinstance(entry.node, MappingNode) or entry.node.flow_style:
+        return False
+    keys = {str(key.value): value for key, value in entry.node.value}
+    inner = keys.get("stages")
+    if not keys.keys() <= {*GROUP_KEYS} or not isinstance(inner, MappingNode) or inner.flow_style:
+        return False
+    return not any(_SHARED.search(line) for line in entry.lines) and not any(map(_has_long_text, keys.values()))
+
+
+def _group(entry: _Entry, lines: list[str], *, padded: int, indent: str) -> Iterator[str]:
+    """Yield the lines of a group: one if it has a single stage and fits, else its stages as those of the file."""
+    node = entry.node
+    assert isinstance(node, MappingNode)
+    single = next(value for key, value in node.value if key.value == "stages")
+    if len(single.value) == 1 and _is_plain(entry):
+        made = list(_stage(entry, padded, indent))
+        if len(made) == 1:
+            yield made[0]
+            return
+    start = _line_of(entry, lines)
+    parts, rest = _entries(node, lines, end=start + len(entry.lines))
+    parts[0].before = [line.strip() for line in lines[start + 1 : node.value[0][0].start_mark.line]]
+    parts.sort(key=lambda part: GROUP_KEYS.index(part.key))
+    comment = _comment_behind(entry.lines[0])
+    yield f"{indent}{entry.key}:" + (f"  {comment}" if comment else "")
+    inner = f"{indent}  "
+    for part in parts:
+        for line in part.before:
+            yield f"{inner}{line}".rstrip()
+        if part.key == "stages":
+            yield from _stages(part, lines, inner)
+        elif _is_plain(part):
+            yield f"{inner}{part.key}: {_block(part.node)}" + (f"  {part.behind}" if part.behind else "")
+        else:
+            yield from _written(part, indent=inner)
+    for line in rest:
+        yield f"{inner}{line}".rstrip()
+
+
+def _line_of(entry: _Entry, lines: list[str]) -> int:
     """Return the line of an entry's key."""
-    return lines.index(entry.lines[0])
+    return next(idx for idx, line in enumerate(lines) if line is entry.lines[0])
 
 
-def _stage(entry: _Entry, padded: int) -> Iterator[str]:
+def _stage(entry: _Entry, padded: int, indent: str) -> Iterator[str]:
     if not isinstance(entry.node, MappingNode) or not _is_plain(entry):
-        yield from _written(entry, indent="  ")
+        yield from _written(entry, indent=indent)
         return
-    pairs = [(str(key.value), value) for key, value in entry.node.value]
-    pairs.sort(key=lambda pair: 0 if pair[0] == "use" else 2 if pair[0] in RESERVED_KEYS else 1)
+    pairs = _sorted(entry.node)
     behind = f"  {entry.behind}" if entry.behind else ""
-    text = ", ".join(f"{_scalar(key)}: {_flow(value)}" for key, value in pairs)
-    line = f"  {f'{entry.key}:'.ljust(max(padded, len(entry.key) + 2))}{{{text}}}{behind}"
+    text = ", ".join(f"{_scalar(key)}: {_value(key, value)}" for key, value in pairs)
+    line = f"{indent}{f'{entry.key}:'.ljust(max(padded, len(entry.key) + 2))}{{{text}}}{behind}"
     if len(line) <= WIDTH:
         yield line
         return
-    yield f"  {entry.key}:{behind}"
+    yield f"{indent}{entry.key}:{behind}"
     for key, value in pairs:
-        yield f"    {_scalar(key)}: {_flow(value)}"
+        yield f"{indent}  {_scalar(key)}: {_value(key, value)}"
+
+
+def _sorted(node: MappingNode) -> list[tuple[str, Node]]:
+    """Return the keys and values of a stage or a group: what it is first, then its settings, then the other keys."""
+    pairs = [(str(key.value), value) for key, value in node.value]
+    first, last = ("use", "group"), (*RESERVED_KEYS, "stages")
+    return sorted(pairs, key=lambda pair: 0 if pair[0] in first else 2 if pair[0] in last else 1)
+
+
+def _value(key: str, node: Node) -> str:
+    """Return a value of a stage or a group on one line."""
+    if key != "stages" or not isinstance(node, MappingNode):
+        return _flow(node)
+    inner = ((str(name.value), value) for name, value in node.value)
+    return "{" + ", ".join(f"{_scalar(name)}: {_entry_text(value)}" for name, value in inner) + "}"
+
+
+def _entry_text(node: Node) -> str:
+    """Return a stage in a group on one line."""
+    if not isinstance(node, MappingNode):
+        return _flow(node)
+    return "{" + ", ".join(f"{_scalar(key)}: {_flow(value)}" for key, value in _sorted(node)) + "}"
 
 
 def _written(entry: _Entry, *, indent: str) -> Iterator[str]:
@@ -171,6 +238,13 @@ def _has_long_text(node: Node) -> bool:
     return any(_has_long_text(part) for part in parts)
 
 
+def _block(node: Node) -> str:
+    """Return a value behind a key on a line of its own, where a text may contain commas and quotes."""
+    text = str(node.value)
+    is_text = isinstance(node, ScalarNode) and text[:1].isalpha() and not set(text) & set("#\n:") and text.isprintable()
+    return text if is_text and text == text.strip() and _is_read_as(text, text) else _flow(node)
+
+
 def _flow(node: Node) -> str:
     if isinstance(node, MappingNode):
         return "{" + ", ".join(f"{_scalar(str(key.value))}: {_flow(value)}" for key, value in node.value) + "}"
@@ -187,8 +261,16 @@ def _flow(node: Node) -> str:
 
 def _scalar(text: str) -> str:
     """Return a text as YAML, without quotes if it needs none."""
-    plain = not _NOT_PLAIN.search(text) and parse_yaml(f"[{text}]", "").plain() == [text]
+    plain = not _NOT_PLAIN.search(text) and _is_read_as(f"[{text}]", [text])
     return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def _is_read_as(text: str, value: object) -> bool:
+    """Return whether a YAML text means a value; one that is refused, such as an infinite number, does not."""
+    try:
+        return bool(parse_yaml(text, "").plain() == value)
+    except WorkflowError:
+        return False
 
 
 def _comment_behind(line: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from pano_mvs.engine.stages.params import Params, files_of, takes_path
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest
+from pano_mvs.engine.workflows.merged_stages import MergedStages, StageGroup
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
-from pano_mvs.engine.workflows.workflow_file import ExtendsReader, WorkflowFile, merge_stages, read_text
+from pano_mvs.engine.workflows.workflow_file import WorkflowFile, WorkflowFilesReader, read_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,7 @@ class StageEntry:
     policy: Policy
     place: str  # `file:line:column` of its name
     places: dict[str, str] = field(default_factory=dict)  # port or setting to `file:line:column`
+    group: str = ""  # the group of stages that it belongs to; empty if it is in none
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +42,14 @@ class Workflow:
 
     name: str  # for the output folder and the report
     path: Path | None
-    text: str  # the YAML, followed by that of the files that it extends
+    text: str  # the YAML, followed by that of the files that it extends and of the groups
     stages: dict[str, StageEntry]  # in the order of the file
     overrides: tuple[str, ...] = ()  # the `--set` and `--images` options that were applied
     # its plugin files, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()  # why optional stages are missing
-    files: tuple[Path, ...] = ()  # its file, and those that it extends
+    warnings: tuple[str, ...] = ()  # such as why optional stages are missing
+    files: tuple[Path, ...] = ()  # its file, those that it extends, and those of groups
+    groups: Mapping[str, StageGroup] = field(default_factory=dict)  # by name, in order; a stage may be in none
 
     @property
     def id(self) -> str:
@@ -61,18 +64,21 @@ def load_workflow(
     overrides: Sequence[str] = (),
     images: Path | None = None,
     presets: Path | None = None,
+    on_file: Callable[[Path], None] = lambda _: None,
 ) -> Workflow:
     """Read and validate a workflow file.
 
     Args:
         path: the YAML file; relative paths in it start from its folder.
         registry: the known stages; the plugin files of the workflow are added to it.
+        on_file: called with each file of the workflow before it is read, and with those that are missing.
 
     Raises:
         InputError: if the file cannot be read.
         WorkflowError: with every error and its location.
     """
-    reader = WorkflowReader(str(path), path.parent, registry, presets=presets)
+    on_file(path)
+    reader = WorkflowReader(str(path), path.parent, registry, presets=presets, on_file=on_file)
     return reader.read(read_text(path), overrides=overrides, images=images, path=path)
 
 
@@ -88,11 +94,20 @@ class InvalidWorkflowError(WorkflowError):
 class WorkflowReader:
     """Turns YAML into a workflow and collects errors."""
 
-    def __init__(self, shown_as: str, base: Path, registry: Registry, *, presets: Path | None = None) -> None:
+    def __init__(
+        self,
+        shown_as: str,
+        base: Path,
+        registry: Registry,
+        *,
+        presets: Path | None = None,
+        on_file: Callable[[Path], None] = lambda _: None,
+    ) -> None:
         self.shown_as = shown_as
         self.base = base
         self.registry = registry
         self.presets = presets
+        self.on_file = on_file
         self.problems = Problems()
         self.plugins: dict[Path, str] = {}
         self._lacks_plugins = False
@@ -102,29 +117,37 @@ class WorkflowReader:
         self, text: str, *, overrides: Sequence[str] = (), images: Path | None = None, path: Path | None = None
     ) -> Workflow:
         """Return the workflow, or raise WorkflowError with every error."""
-        files = self._read_files(text, path)
-        entries = merge_stages(files, self.problems)
-        for file in files:
+        files, merged = self._read_files(text, path)
+        rest = self._apply_to_groups(merged, overrides, files[-1])
+        entries = merged.stages
+        for file in (*merged.group_files, *files):
             self._load_plugins(file.root.value.get("plugins"))
-        applying = _Overrides(entries, self.problems, self._load_plugin, self._params_of)
-        applying.apply(overrides, images=images)
+        groups = merged.groups(list(entries))
+        applying = _Overrides(entries, groups, self.problems, self._load_plugin, self._params_of)
+        applying.apply(rest, images=images)
         if not entries and not self.problems.lines:
             self.problems.add(files[-1].root.place, "no stage is left")
         left_out = self._leave_out(entries)
-        stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
+        groups = merged.groups(list(entries))
+        stages = {
+            name: entry for name, node in entries.items() if (entry := self._stage(name, node, groups)) is not None
+        }
         if self.problems.lines:
-            written = {name for file in files for name, node in file.stages.items() if node.value is not None}
-            raise InvalidWorkflowError(self.problems.lines, stages, frozenset({*written, *entries} - set(stages)))
+            unknown = frozenset({*merged.written, *entries} - set(stages))
+            raise InvalidWorkflowError(self.problems.lines, stages, unknown)
         root = files[-1].root
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
-        below = (f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in files[:-1])
+        others = {file.shown_as: ("extended", file) for file in files[:-1]}
+        others |= {file.shown_as: ("group", file) for file in merged.group_files if file.shown_as not in others}
+        below = (f"\n---\n# {what}: {shown_as}\n{file.text}" for shown_as, (what, file) in others.items())
         text = "".join([files[-1].text, *below])
-        paths = () if path is None else (*(Path(file.shown_as) for file in files[:-1]), path)
-        return Workflow(name, path, text, stages, tuple(shown), self.plugins, left_out, paths)
+        paths = () if path is None else (*map(Path, others), path)
+        warnings = (*merged.notes, *left_out)
+        return Workflow(name, path, text, stages, tuple(shown), self.plugins, warnings, paths, groups)
 
-    def inherited(self, text: str, path: Path) -> dict[str, Located]:
-        """Return the stages that a file inherits, and load the plugins of all its files.
+    def inherited(self, text: str, path: Path) -> tuple[dict[str, Located], frozenset[str]]:
+        """Return the stages and the groups that a file has from other files, and load the plugins of all its files.
 
         Errors are ignored, as this serves editors while the file is being written.
 
@@ -132,16 +155,45 @@ class WorkflowReader:
             WorkflowError: if the text is not YAML.
         """
         parse_yaml(text, self.shown_as)  # without a list of problems, it raises the first one
-        files = self._read_files(text, path)
-        for file in files:
+        files, merged = self._read_files(text, path)
+        for file in (*merged.group_files, *files):
             self._load_plugins(file.root.value.get("plugins"))
-        return merge_stages(files[:-1], self.problems)
+        below = MergedStages(merged.reader, self.problems)
+        for file in files[:-1]:
+            below.add(file)
+        own = files[-1].shown_as
+        from_groups = {name: node for name, node in merged.stages.items() if node.value["use"].file != own}
+        return from_groups | below.stages, frozenset(below.groups(list(below.stages)))
 
-    def _read_files(self, text: str, path: Path | None) -> list[WorkflowFile]:
-        reader = ExtendsReader(self.problems, self.presets)
+    def _read_files(self, text: str, path: Path | None) -> tuple[list[WorkflowFile], MergedStages]:
+        """Return a workflow after the files that it extends, and their stages."""
+        reader = WorkflowFilesReader(self.problems, self.presets, self.on_file)
         reader.read(text, self.shown_as, self.base, chain=(resolved(path),) if path is not None else ())
-        self.folders = {file.shown_as: file.base for file in reader.files}
-        return reader.files
+        merged = MergedStages(reader, self.problems)
+        for file in reader.files:
+            merged.add(file)
+        self.folders = {file.shown_as: file.base for file in (*reader.files, *merged.group_files)}
+        return reader.files, merged
+
+    def _apply_to_groups(self, merged: MergedStages, overrides: Sequence[str], file: WorkflowFile) -> list[str]:
+        """Remove and replace groups by `GROUP=null` and `GROUP.group=FILE`, and return the other overrides."""
+        rest: list[str] = []
+        for text in overrides:
+            target, equals, written = text.partition("=")
+            name, _, key = target.strip().rpartition(".")
+            groups = merged.groups(list(merged.stages))
+            origin = f"--set {target.strip()}"
+            if equals and target.strip() in groups and written.strip() in {"null", "~"}:
+                entry = Located(None, 0, 0, origin=origin)
+                merged.apply(file, {target.strip(): entry})
+            elif equals and key == "group" and name in groups and name not in merged.stages:
+                value = Located(written.strip(), 0, 0, origin=origin)
+                entry = Located({"group": value}, 0, 0, origin=origin)
+                merged.apply(replace(file, inherits=file.inherits | {file.shown_as}), {name: entry})
+            else:
+                rest.append(text)
+        self.folders |= {one.shown_as: one.base for one in merged.group_files}
+        return rest
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:
@@ -159,6 +211,7 @@ class WorkflowReader:
         path = self._folder(item) / item.value
         if path in self.plugins:
             return
+        self.on_file(path)
         try:
             self.registry.add_file(path)
             self.plugins[path] = code_digest(path)
@@ -194,7 +247,7 @@ class WorkflowReader:
             for name, use in missing.items()
         )
 
-    def _stage(self, name: str, node: Located) -> StageEntry | None:
+    def _stage(self, name: str, node: Located, groups: Mapping[str, StageGroup]) -> StageEntry | None:
         use = node.value["use"]
         spec = self.registry.stages.get(use.value) if isinstance(use.value, str) else None
         if spec is None and self._lacks_plugins:
@@ -209,6 +262,10 @@ class WorkflowReader:
             message = f"{use.value} needs packages that are not installed: pip install {packages}"
             self.problems.add(use.place, f"stage {name!r}: {message}")
         values = node.plain()
+        for key in {"group", "stages"} & values.keys() - spec.params_type.model_fields.keys():
+            del values[key]
+            shown = f"; groups of this workflow: {', '.join(groups)}" if groups else ""
+            self.problems.add(node.value[key].key_place, f"{name!r} is a stage, and {key!r} is for groups{shown}")
         policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name=name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
         params = self._validate(spec.params_type, own, node, name=name)
@@ -217,8 +274,10 @@ class WorkflowReader:
         wiring = node.value.get("in")
         if wiring is not None and isinstance(wiring.value, dict):
             places.update({f"in.{port}": item.place for port, item in wiring.value.items()})
+        group = next((one for one, found in groups.items() if name in found.stages), "")
         # Continue after errors in settings, so that the connections are checked too.
-        return StageEntry(name, spec, params or Params(), policy or Policy(use=spec.name), node.key_place, places)
+        policy = policy or Policy(use=spec.name)
+        return StageEntry(name, spec, params or Params(), policy, node.key_place, places, group)
 
     def _valid_part(self, model: type[Params], values: dict[str, Any], node: Located) -> Params:
         """Return settings without those that are wrong, so that the files of the others are checked too."""
@@ -308,6 +367,7 @@ class _Overrides:
     """Applies what is set for a run to the merged entries of the stages, in place."""
 
     stages: dict[str, Located]
+    groups: Mapping[str, StageGroup]
     problems: Problems
     load_plugin: Callable[[Located], None]
     params_of: Callable[[Located], type[Params] | None]  # an entry to the model of its settings
@@ -359,7 +419,12 @@ class _Overrides:
         place, stage = f"--set {override.text[:80]}", _stage_of(override.target, self.stages)
         if not stage:
             wanted = override.target.partition(".")[0]
-            self.problems.add(place, f"no stage {wanted[:80]!r}.{did_you_mean(wanted, self.stages)}")
+            if group := self.groups.get(wanted):
+                stages = ", ".join(group.stages)
+                self.problems.add(place, f"{wanted!r} is a group of stages; set a setting of one of them: {stages}")
+                return
+            names = [*self.stages, *self.groups]
+            self.problems.add(place, f"no stage {wanted[:80]!r}.{did_you_mean(wanted, names)}")
             return
         steps = tuple(override.target[len(stage) + 1 :].split("."))
         if not all(steps):

@@ -1,9 +1,9 @@
-"""Read a workflow file with its top-level keys, and the files that it extends; merge their stages."""
+"""Read a workflow file with its top-level keys, the files that it extends, and the files of its groups of stages."""
 
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from pano_mvs.core.yaml_text import Located, Problems, did_you_mean, parse_yaml
 FORMAT_VERSION = 1
 MAX_BYTES = 100_000
 MAX_FILES = 50
-MAX_STAGES = 1000
+GROUPS_FOLDER = "groups"  # of the presets: the groups of stages that can be named
 TOP_KEYS = ("pano_mvs", "name", "description", "extends", "plugins", "stages")
 
 
@@ -27,10 +27,12 @@ class WorkflowFile:
     base: Path  # folder that its relative paths start from
     text: str
     root: Located
+    chain: tuple[Path, ...] = ()  # the files that led to it, each by the one before; it is last
+    inherits: frozenset[str] = frozenset()  # `shown_as` of the files that it extends, and that these extend
 
     @property
     def stages(self) -> Mapping[str, Located]:
-        """Its entries under `stages:`, by name."""
+        """Its entries under `stages:`, by name: stages and groups of stages."""
         node = self.root.value.get("stages")
         return node.value if node is not None and isinstance(node.value, dict) else {}
 
@@ -72,19 +74,24 @@ def read_text(path: Path, what: str = "workflow") -> str:
 
 
 @dataclass(slots=True)
-class ExtendsReader:
-    """Reads a workflow file and all files that it extends, each once, the extended ones first."""
+class WorkflowFilesReader:
+    """Reads a workflow file and all files that it extends, each once, the extended ones first.
+
+    Files of groups are read on request, with all files that they extend.
+    """
 
     problems: Problems
-    presets: Path | None = None  # folder of the workflows that can be extended by name, or None
+    presets: Path | None = None  # folder of the workflows and groups that can be named, or None
+    on_file: Callable[[Path], None] = lambda _: None  # called with each file before it is read, also a missing one
     files: list[WorkflowFile] = field(default_factory=list)
-    _seen: set[Path] = field(default_factory=set)
+    _seen: dict[Path, str] = field(default_factory=dict)  # extended file to its name in messages
+    _count: list[int] = field(default_factory=lambda: [0])  # number of files so far, in one place for all readers
 
     def read(self, text: str, shown_as: str, base: Path, *, chain: tuple[Path, ...] = ()) -> None:
         """Read a workflow and, before it, the files that it extends.
 
         Args:
-            chain: the files that extend each other up to this one, which is last; empty if the text is not a file.
+            chain: the files that lead to this one, each by the one before; empty if the text is not a file.
         """
         root = parse_yaml(text, shown_as, self.problems)
         if not isinstance(root.value, dict):
@@ -95,11 +102,27 @@ class ExtendsReader:
                 ]
             )
         self._check_top(root)
+        names: list[str] = []
         for item in self._extended(root):
             path = self._find(item, base)
-            if path is not None:
-                self._follow(item, path, chain)
-        self.files.append(WorkflowFile(shown_as, base, text, root))
+            if path is not None and (name := self._follow(item, path, chain)):
+                names.append(name)
+        inherited = (file.inherits for file in self.files if file.shown_as in names)
+        inherits = frozenset(names).union(*inherited)
+        self.files.append(WorkflowFile(shown_as, base, text, root, chain, inherits))
+
+    def read_group(self, item: Located, file: WorkflowFile) -> list[WorkflowFile]:
+        """Return the file of a group, last, after the files that it extends; empty with problems if it is unusable.
+
+        Args:
+            item: the value of `group`: a file, or the name of a shipped group.
+            file: the file that contains it.
+        """
+        path = self._find_group(item, resolved(Path()) if item.origin else file.base)
+        reader = WorkflowFilesReader(self.problems, self.presets, self.on_file, _count=self._count)
+        if path is not None:
+            reader._follow(item, path, file.chain, key="group")
+        return reader.files
 
     def _extended(self, root: Located) -> Iterator[Located]:
         node = root.value.get("extends")
@@ -116,33 +139,62 @@ class ExtendsReader:
         path = base / name
         if exists(path):
             return path
-        preset = self.presets / f"{name}.yaml" if self.presets and is_plain_name(name) else None
-        if preset is not None and is_file(preset):
-            return preset
-        names = [file.stem for file in children(self.presets, "*.yaml")] if self.presets else []
+        for folder in self._folders():
+            if is_plain_name(name) and is_file(preset := folder / f"{name}.yaml"):
+                return preset
+        self.on_file(path)
+        names = [file.stem for folder in self._folders() for file in children(folder, "*.yaml")]
         names += [file.name for file in children(base, "*.yaml")]
         hint = did_you_mean(name, sorted(names))
         self.problems.add(item.place, f"extends: there is no file {str(path)[:200]} and no preset {name[:80]!r}.{hint}")
         return None
 
-    def _follow(self, item: Located, path: Path, chain: tuple[Path, ...]) -> None:
+    def _find_group(self, item: Located, base: Path) -> Path | None:
+        name = item.value
+        if not isinstance(name, str) or not name:
+            self.problems.add(item.place, "group: must be a file with the stages of the group, or a shipped group")
+            return None
+        path, folder = base / name, self._folders()[-1:]
+        shipped = [folder[0] / f"{name}.yaml"] if folder and is_plain_name(name) else []
+        for found in (path, *shipped):  # a folder beside the workflow may have the name of a shipped group
+            if is_file(found):
+                return found
+        self.on_file(path)
+        names = [file.stem for one in folder for file in children(one, "*.yaml")]
+        hint = did_you_mean(name, sorted([*names, *(file.name for file in children(base, "*.yaml"))]))
+        why = f"there is no file {str(path)[:200]} and no shipped group {name[:80]!r}.{hint}"
+        self.problems.add(item.place, f"group: {why}")
+        return None
+
+    def _folders(self) -> list[Path]:
+        """Return the folders of the workflows and of the groups that can be named."""
+        return [self.presets, self.presets / GROUPS_FOLDER] if self.presets else []
+
+    def _follow(self, item: Located, path: Path, chain: tuple[Path, ...], *, key: str = "extends") -> str:
+        """Read a file that another one names, and return its name in messages; empty if it cannot be read."""
         real = resolved(path)
         if real in chain:
             circle = " → ".join(file.name for file in (*chain[chain.index(real) :], real))
-            self.problems.add(item.place, f"extends: the files extend each other in a circle: {circle}")
-            return
+            what = "the group contains itself" if key == "group" else "the files extend each other in a circle"
+            self.problems.add(item.place, f"{key}: {what}: {circle}")
+            return ""
         if real in self._seen:
-            return
-        self._seen.add(real)
-        if len(self._seen) > MAX_FILES:
-            raise WorkflowError([*self.problems.lines, f"{item.place}: extends: at most {MAX_FILES} files are allowed"])
+            return self._seen[real]
+        self._seen[real] = str(path)
+        self._count[0] += 1
+        if self._count[0] > MAX_FILES:
+            raise WorkflowError([*self.problems.lines, f"{item.place}: {key}: at most {MAX_FILES} files are allowed"])
+        self.on_file(path)
         try:
             self.read(read_text(path), str(path), path.parent, chain=(*chain, real))
         except InputError as error:
-            self.problems.add(item.place, f"extends: {error}")
+            self.problems.add(item.place, f"{key}: {error}")
+            return ""
         except WorkflowError as error:  # the file is not YAML, or too large; this one may have further mistakes
             known = len(self.problems.lines)
             self.problems.lines += error.problems[known if error.problems[:known] == self.problems.lines else 0 :]
+            return ""
+        return str(path)
 
     def _check_top(self, root: Located) -> None:
         for key, node in root.value.items():
@@ -155,8 +207,10 @@ class ExtendsReader:
             )
         elif version.value != FORMAT_VERSION or isinstance(version.value, bool):
             shown = repr(version.plain())[:80]
+            is_newer = isinstance(version.value, int) and version.value > FORMAT_VERSION
+            remedy = ". A newer pano_mvs reads it: upgrade" if is_newer else ""
             self.problems.add(
-                version.place, f"workflow format {shown} is not supported; this version reads {FORMAT_VERSION}"
+                version.place, f"workflow format {shown} is not supported; this version reads {FORMAT_VERSION}{remedy}"
             )
         if "name" in root.value and not is_plain_name(root.value["name"].plain()):
             self.problems.add(
@@ -167,62 +221,3 @@ class ExtendsReader:
         missing = node is None and "extends" in root.value
         if not missing and (node is None or not isinstance(node.value, dict) or not node.value):
             self.problems.add((node or root).place, "`stages:` must be a mapping of stage names to {use: …}")
-
-
-def merge_stages(files: Sequence[WorkflowFile], problems: Problems) -> dict[str, Located]:
-    """Merge the stages of several files; later files override earlier ones.
-
-    An entry for an existing stage keeps the position of the stage and overrides single settings. With another `use` it
-    replaces the stage, and `null` removes it. A new stage is inserted behind the stage that precedes it in its file,
-    else before the one that follows it, else at the end.
-    """
-    stages: dict[str, Located] = {}
-    for file in files:
-        order = list(stages)
-        written = list(file.stages)
-        for idx, name in enumerate(written):
-            if name not in stages:
-                order.insert(_position(order, written, idx), name)
-        for name, node in file.stages.items():
-            _merge_entry(stages, name, node, problems=problems)
-        stages = {name: stages[name] for name in order if name in stages}
-        if len(stages) > MAX_STAGES:
-            raise WorkflowError([*problems.lines, f"{file.root.place}: at most {MAX_STAGES} stages are allowed"])
-    return stages
-
-
-def _position(order: Sequence[str], written: Sequence[str], idx: int) -> int:
-    if idx:
-        return order.index(written[idx - 1]) + 1
-    return next((order.index(name) for name in written[1:] if name in order), len(order))
-
-
-def _merge_entry(stages: dict[str, Located], name: str, node: Located, *, problems: Problems) -> None:
-    if not is_plain_name(name):
-        problems.add(
-            node.key_place,
-            f"stage name {name[:80]!r} must consist of letters, digits, '-', '_' and '.', and be a valid folder name",
-        )
-    elif node.value is None and name in stages:
-        del stages[name]
-    elif node.value is None:
-        hint = did_you_mean(name, stages) if stages else " Write `{use: NAME}`"
-        problems.add(
-            node.key_place, f"stage {name!r} needs `use: NAME`; there is no stage of that name to remove.{hint}"
-        )
-    elif not isinstance(node.value, dict):
-        problems.add(node.key_place, f"stage {name!r} needs `use: NAME`: write `{name}: {{use: …}}`")
-    elif "use" not in node.value and name not in stages:
-        hint = f"; no file that is extended has a stage of that name.{did_you_mean(name, stages)}" if stages else ""
-        problems.add(node.key_place, f"stage {name!r} needs `use: NAME`{hint}")
-    else:
-        stages[name] = merged_entry(stages.get(name), node)
-
-
-def merged_entry(below: Located | None, above: Located) -> Located:
-    """Return a stage's entry with overrides from a later file; another `use` replaces the entry."""
-    mine = above.value.get("use")
-    if below is None or (mine is not None and mine.value != below.value["use"].value):
-        return above
-    value = {**below.value, **above.value}
-    return Located(value, above.line, above.column, above.key_line, above.key_column, above.origin, above.file)

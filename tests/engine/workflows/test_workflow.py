@@ -57,7 +57,7 @@ def test_an_optional_stage_that_no_plugin_offers_is_left_out_and_named(toy: Toy)
     toy.edit("wf.yaml", lambda text: text + "  extra: {use: toy.nobody, optional: true, by: 3}\n")
     session = toy.session()
     assert "extra" not in session.workflow.stages
-    (reason,) = session.workflow.left_out
+    (reason,) = session.workflow.warnings
     assert reason.startswith("stage 'extra' is left out, because it is optional and no plugin offers toy.nobody")
     toy.edit("wf.yaml", lambda text: text.replace("toy.nobody, optional: true", "toy.nobody, optional: false"))
     with pytest.raises(WorkflowError, match=r"stage 'extra': there is no stage 'toy\.nobody'"):
