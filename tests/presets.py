@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from ruamel.yaml import YAML
-
+from pano_mvs.core.yaml_text import Located, Problems
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.merged_stages import MergedStages
+from pano_mvs.engine.workflows.workflow_file import WorkflowFilesReader, read_text
 from pano_mvs.session.session import presets_folder
 
 
@@ -17,20 +17,17 @@ def usable_presets() -> list[Path]:
     return [
         path
         for path in sorted(presets_folder().glob("*.yaml"))
-        if all(entry["use"] in registered or entry.get("optional") is True for entry in _stages(path).values())
+        if all(entry.plain()["use"] in registered or "optional" in entry.value for entry in _stages(path).values())
     ]
 
 
-def _stages(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the entries of a preset, with those of the presets that it extends."""
-    value = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    extended = value.get("extends") or []
-    stages: dict[str, dict[str, Any]] = {}
-    for name in [extended] if isinstance(extended, str) else extended:
-        stages |= _stages(path.with_name(f"{name}.yaml"))
-    for name, entry in (value.get("stages") or {}).items():
-        if entry is None:
-            stages.pop(name, None)
-        else:
-            stages[name] = stages.get(name, {}) | entry
-    return stages
+def _stages(path: Path) -> dict[str, Located]:
+    """Return the entries of a preset, with those of its groups and of the presets that it extends."""
+    problems = Problems()
+    reader = WorkflowFilesReader(problems, presets_folder())
+    reader.read(read_text(path), str(path), path.parent)
+    merged = MergedStages(reader, problems)
+    for file in reader.files:
+        merged.add(file)
+    problems.raise_if_any()
+    return merged.stages

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
-from ruamel.yaml import YAML
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.workflow import load_workflow
 
 WORKFLOWS = Path(__file__).parents[2] / "workflows"
 
@@ -15,15 +15,23 @@ _INTRODUCTION = """# Shipped workflows
 Run a preset by its name (`pano-mvs run quickstart --images photos`), or modify it in your own workflow with `extends:`
 ([Workflows](../workflows.md)). In all of them, the source is called `images`, the pose solver `poses` and the sweep
 `depth`, so `--set depth.planes=192` works with each. Without `--images`, they run on an included sample capture. This
-page shows the files unchanged."""
+page shows the files unchanged, and below them the [groups of stages](../workflows.md#groups-of-stages) that they
+share."""
 
 
 def preset_page() -> str:
     """Return the page of all shipped workflows."""
     parts = [_INTRODUCTION]
     for path in sorted(WORKFLOWS.glob("*.yaml")):
-        parts += [f"## {path.stem}", f"```yaml\n{path.read_text(encoding='utf-8').rstrip()}\n```"]
+        parts += [f"## {path.stem}", _text(path)]
+    parts.append("## Groups of stages")
+    for path in sorted((WORKFLOWS / "groups").glob("*.yaml")):
+        parts += [f"### groups/{path.name}", _text(path)]
     return "\n\n".join(parts) + "\n"
+
+
+def _text(path: Path) -> str:
+    return f"```yaml\n{path.read_text(encoding='utf-8').rstrip()}\n```"
 
 
 def presets_that_use(stage: str) -> str:
@@ -35,5 +43,5 @@ def presets_that_use(stage: str) -> str:
 
 @cache
 def _uses(path: Path) -> set[str]:
-    stages: dict[str, Any] = YAML(typ="safe").load(path)["stages"]
-    return {entry["use"] for entry in stages.values() if entry and "use" in entry}
+    workflow = load_workflow(path, Registry.installed(), presets=WORKFLOWS)
+    return {entry.spec.name for entry in workflow.stages.values()}

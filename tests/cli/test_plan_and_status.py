@@ -257,10 +257,26 @@ def test_a_resolved_workflow_depends_on_no_other_file_and_computes_nothing_again
     assert "(nothing to compute)" in again.text
 
 
-def test_without_resolved_the_files_are_shown_as_they_are(pano_mvs: Command, toy: Toy) -> None:
+def test_a_workflow_is_shown_as_its_groups(pano_mvs: Command, toy: Toy) -> None:
+    shown = pano_mvs("show", "quality").text
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in shown.splitlines() if line.startswith("│")]
+    assert [row[0] for row in rows] == [
+        *("source", "masks", "keypoints", "matching", "cameras", "sweep", "filters", "layout", "exports")
+    ]
+    assert rows[4][1:] == [
+        "camera poses, verified, refined and levelled",
+        "poses, verified, refined, levelled, house",
+    ]
+    assert f"{len(open_session('quality').workflow.stages)} stages; --resolved prints them" in shown
+    beside = pano_mvs("show", toy.folder / "wf.yaml").text
+    assert "│       │ Multiply." in beside
+    assert "9 stages" in beside
+
+
+def test_the_files_are_shown_as_they_are(pano_mvs: Command, toy: Toy) -> None:
     text = "pano_mvs: 1\nextends: wf.yaml  # mine\nstages: {scaled: {by: 5}}\n"
     (toy.folder / "top.yaml").write_text(text)
-    shown = pano_mvs("show", toy.folder / "top.yaml").text
+    shown = pano_mvs("show", toy.folder / "top.yaml", "--text").text
     assert shown.startswith(text)
     assert f"# extended: {toy.folder / 'wf.yaml'}" in shown
     assert "toy.difference" in shown
@@ -353,6 +369,10 @@ def test_where_it_cannot_be_written_or_read(pano_mvs: Command) -> None:
     assert pano_mvs("schema", "bad.yaml").code == 2
 
 
+GROUP_FILE = "pano_mvs: 1\nstages:\n  again: {use: toy.scale}\n"
+NEW_PLUGIN = 'from pano_mvs.api import Pairs, stage\n\n\n@stage(\'a.b\')\ndef f() -> Pairs:\n    """Nothing."""\n'
+
+
 def test_a_workflow_is_checked_again_after_each_change_of_its_files(
     toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -376,6 +396,50 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
     assert shown.out.count("no mistakes") == 2
     assert "there is no stage 'toy.scael'" in shown.err
     assert "broken" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("entry", "file", "wrong", "right"),
+    [
+        (
+            "extends: below.yaml",
+            "below.yaml",
+            "pano_mvs: 1\nextends: wf.yaml\nstages: [",
+            "pano_mvs: 1\nextends: wf.yaml\n",
+        ),
+        ("extends: below.yaml", "below.yaml", None, "pano_mvs: 1\nextends: wf.yaml\n"),
+        ("extends: wf.yaml\nstages: {more: {group: more.yaml}}", "more.yaml", None, GROUP_FILE),
+        ("extends: wf.yaml\nstages: {more: {group: more.yaml}}", "more.yaml", f"{GROUP_FILE}    b: [\n", GROUP_FILE),
+        ("extends: wf.yaml\nplugins: [new.py]", "new.py", None, NEW_PLUGIN),
+        ("extends: wf.yaml\nplugins: [new.py]", "new.py", "def f(:\n", NEW_PLUGIN),
+    ],
+)
+def test_a_first_check_that_fails_watches_all_files(
+    toy: Toy,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    entry: str,
+    file: str,
+    wrong: str | None,
+    right: str,
+) -> None:
+    """Only the main file was watched if the mistake was in another one, or another one was missing."""
+    monkeypatch.chdir(toy.folder)
+    Path("child.yaml").write_text(f"pano_mvs: 1\n{entry}\n")
+    if wrong is not None:
+        Path(file).write_text(wrong)
+    changes: list[Callable[[], object]] = [lambda: Path(file).write_text(right)]
+
+    def sleep(_seconds: float) -> None:
+        if not changes:
+            raise KeyboardInterrupt
+        changes.pop(0)()
+
+    with pytest.raises(KeyboardInterrupt):
+        watch_workflow("child.yaml", [], None, sleep=sleep)
+    shown = capsys.readouterr()
+    assert "error:" in shown.err
+    assert shown.out.count("no mistakes") == 1
 
 
 def test_a_change_during_a_check_is_not_missed(

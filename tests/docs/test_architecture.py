@@ -11,6 +11,7 @@ import pytest
 
 from pano_mvs import stages
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.session.session import open_session
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -85,8 +86,7 @@ def test_stages_are_defined_where_the_page_says() -> None:
 
 
 def test_the_table_of_stages_has_all_of_quickstart_that_the_cloud_needs() -> None:
-    workflow = (ROOT / "workflows" / "quickstart.yaml").read_text(encoding="utf-8")
-    used = re.findall(r"^  \w+: +\{use: ([\w.]+)", workflow, re.MULTILINE)
+    used = [entry.spec.name for entry in open_session("quickstart").workflow.stages.values()]
     shown = [row[0].strip("`") for row in rows("stages")]
     end = used.index("fusion.vote") + 1
     assert shown[:end] == used[:end]

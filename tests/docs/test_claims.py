@@ -16,10 +16,12 @@ from typer.core import TyperOption
 import pano_mvs
 from pano_mvs.core.yaml_text import MAX_DEPTH, MAX_VALUES
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.merged_stages import MAX_STAGES
 from pano_mvs.engine.workflows.policy import Policy
-from pano_mvs.engine.workflows.workflow_file import MAX_BYTES, MAX_FILES, MAX_STAGES
+from pano_mvs.engine.workflows.workflow_file import MAX_BYTES, MAX_FILES
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.scene import Poses
+from pano_mvs.session.session import open_session
 from tests.cli.command_tree import all_commands
 
 ROOT = Path(__file__).parents[2]
@@ -120,8 +122,8 @@ def stages_by_name() -> dict[str, set[str]]:
     """Return what the name of a stage in the shipped workflows stands for."""
     found: dict[str, set[str]] = {}
     for path in (ROOT / "workflows").glob("*.yaml"):
-        for name, use in re.findall(r"^  (\w+):\s+(?:\{use: |\n    use: )([\w.]+)", path.read_text(), re.MULTILINE):
-            found.setdefault(name, set()).add(use)
+        for name, entry in open_session(path).workflow.stages.items():
+            found.setdefault(name, set()).add(entry.spec.name)
     return found
 
 

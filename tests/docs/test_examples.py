@@ -20,9 +20,9 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
+from pano_mvs.session.session import open_session
 from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.synthetic.tour_files import write_tour
 from tests.synthetic.video_files import tiny_video
@@ -30,7 +30,9 @@ from tests.synthetic.video_files import tiny_video
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-NO_WORKFLOW = tuple(f"<!-- {mark} -->\n" for mark in ("variants", "calibration", "queue", "rooms", "combinations"))
+NO_WORKFLOW = tuple(
+    f"<!-- {mark} -->\n" for mark in ("variants", "calibration", "queue", "rooms", "combinations", "group")
+)
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
     "phone",
@@ -236,12 +238,10 @@ def settings_in_text() -> list[Any]:
 @pytest.fixture(scope="module")
 def specs_by_stage() -> dict[str, list[StageSpec]]:
     """What each name of a stage in the shipped workflows stands for."""
-    registry = Registry.installed()
     specs: dict[str, list[StageSpec]] = defaultdict(list)
     for path in (ROOT / "workflows").glob("*.yaml"):
-        for name, entry in YAML(typ="safe").load(path)["stages"].items():
-            if "use" in entry:
-                specs[name].append(registry.stages[entry["use"]])
+        for name, entry in open_session(path).workflow.stages.items():
+            specs[name].append(entry.spec)
     return specs
 
 
@@ -249,7 +249,7 @@ def specs_by_stage() -> dict[str, list[StageSpec]]:
 def test_every_setting_in_running_text_exists(
     specs_by_stage: dict[str, list[StageSpec]], stage: str, setting: str, value: str
 ) -> None:
-    if setting in RESERVED_KEYS:
+    if setting in RESERVED_KEYS or setting == "group":
         return
     known = [spec for spec in specs_by_stage[stage] if setting in spec.params_type.model_fields]
     assert known

@@ -37,6 +37,11 @@ def test_shipped_workflows_are_valid(schema: dict[str, Any], path: Path) -> None
     assert mistakes(schema, path.read_text(encoding="utf-8")) == []
 
 
+@pytest.mark.parametrize("path", sorted((presets_folder() / "groups").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_groups_are_valid(schema: dict[str, Any], path: Path) -> None:
+    assert mistakes(schema, path.read_text(encoding="utf-8")) == []
+
+
 HEAD = "pano_mvs: 1\nstages:\n  images: {use: source.folder, path: x}\n"
 
 
@@ -73,10 +78,43 @@ HEAD = "pano_mvs: 1\nstages:\n  images: {use: source.folder, path: x}\n"
         HEAD + "  a: {optional: true}",
         HEAD + "  a: {use: depth.sweep, optional: true, plans: 3}",
         "pano_mvs: 1\nextends: quickstart\nstages: {a: {use: nobodys.stage}}",
+        HEAD + "  a: {group: 3, stages: {}}",
+        HEAD + "  a: {group: a.yaml, retries: 2}",
+        HEAD + "  a: {group: a.yaml, stages: [b]}",
+        HEAD + "  a: {group: a.yaml, stages: {../b: {use: pairs.exhaustive}}}",
+        HEAD + "  a: {stages: {b: {use: nobodys.stage}}}",
+        HEAD + "  a: {stages: {b: {use: depth.sweep, planes: many}}}",
+        HEAD + "  a: {stages: {b: {use: pairs.exhaustive}}, description: [c]}",
+        HEAD + "  a: {stages: {b: {use: pairs.exhaustive}}}\n  c: {planes: 64}",
     ],
 )
 def test_wrong_workflows_are_not(schema: dict[str, Any], text: str) -> None:
     assert mistakes(schema, text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        HEAD + "  a: {stages: {b: {use: pairs.exhaustive}}, description: pairs}",
+        HEAD + "  a: {group: a.yaml}\n  depth: {planes: 64}\n  smooth:",
+        HEAD + "  a: {group: a.yaml, stages: {depth: {planes: 64}, smooth: }}",
+        "pano_mvs: 1\nextends: quickstart\nstages: {cameras: , sweep: {stages: {depth: {planes: 64}}}, a: {group: x}}",
+        "pano_mvs: 1\nextends: quickstart\nstages: {metres: {group: 1}}",
+    ],
+)
+def test_groups_are_valid(schema: dict[str, Any], text: str) -> None:
+    assert mistakes(schema, text) == []
+
+
+def test_the_stages_of_groups_are_known(tmp_path: Path) -> None:
+    registry = Registry.installed()
+    reader = WorkflowReader("t", tmp_path, registry, presets=presets_folder())
+    text = "pano_mvs: 1\nstages:\n  sweep: {group: sweep"
+    made = workflow_schema(registry, *reader.inherited(text + "}", tmp_path / "t.yaml"))
+    jsonschema.Draft202012Validator.check_schema(made)
+    assert mistakes(made, text + ", stages: {depth: {planes: 64}}}\n  views: {sources: 2}") == []
+    assert mistakes(made, text + ", stages: {depth: {plans: 64}}}")
+    assert mistakes(made, text + "}\n  views: {source: 2}")
 
 
 @pytest.mark.parametrize(
@@ -120,7 +158,7 @@ def test_stages_and_settings_of_a_workflows_plugins_and_of_what_it_extends_are_k
     text = "pano_mvs: 1\nextends: quickstart\nplugins: [plug.py]\nstages: {}\n"
     registry = Registry.installed()
     reader = WorkflowReader("t", tmp_path, registry, presets=presets_folder())
-    made = workflow_schema(registry, reader.inherited(text, tmp_path / "t.yaml"))
+    made = workflow_schema(registry, *reader.inherited(text, tmp_path / "t.yaml"))
     jsonschema.Draft202012Validator.check_schema(made)
     assert mistakes(made, "pano_mvs: 1\nextends: quickstart\nstages: {s: {use: toy.scale, by: 3}}") == []
     assert mistakes(made, "pano_mvs: 1\nextends: quickstart\nstages: {depth: {planes: 64}, smooth: }") == []

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pano_mvs.core.errors import WorkflowError
@@ -75,7 +75,61 @@ def test_keys_quotes_and_lines_are_the_usual_ones_and_comments_stay() -> None:
     assert parse_yaml(made, "").plain() == parse_yaml(MESSY, "").plain()
 
 
-@pytest.mark.parametrize("preset", sorted(presets_folder().glob("*.yaml")), ids=lambda path: path.stem)
+GROUPS = """\
+pano_mvs: 1
+stages:
+    masks:
+        # of people
+        stages:
+            people: {use: "masks.operator"}   # all
+        group: 'masks'
+    cameras: {stages: {house: {optional: true, use: house.links}}, group: cameras}
+    sweep:
+        stages: {depth: {planes: 64}}
+        group: sweep
+        description: "ranges, and more"
+    exports:    # files
+        description: "clouds, and files"
+        stages:
+            # of points
+            cloud: {in: {ranges: depth}, use: fusion.vote}
+
+            ply: {use: "export.ply"}
+            # all of them
+    layout: {group: layout}
+"""
+NEAT_GROUPS = """\
+pano_mvs: 1
+stages:
+  masks:
+    group: masks
+    # of people
+    stages:
+      people: {use: masks.operator}  # all
+  cameras: {group: cameras, stages: {house: {use: house.links, optional: true}}}
+  sweep:   {group: sweep, description: "ranges, and more", stages: {depth: {planes: 64}}}
+  exports:  # files
+    description: clouds, and files
+    stages:
+      # of points
+      cloud: {use: fusion.vote, in: {ranges: depth}}
+
+      ply:   {use: export.ply}
+      # all of them
+  layout:  {group: layout}
+"""
+
+
+def test_groups_are_laid_out_with_their_stages() -> None:
+    made = formatted(GROUPS, "groups.yaml")
+    assert made == NEAT_GROUPS
+    assert formatted(made, "groups.yaml") == made
+
+
+PRESETS = sorted([*presets_folder().glob("*.yaml"), *(presets_folder() / "groups").glob("*.yaml")])
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
 def test_presets_are_laid_out(preset: Path) -> None:
     text = preset.read_text(encoding="utf-8")
     assert formatted(text, preset.name) == text
@@ -144,6 +198,7 @@ VALUES = st.recursive(
 )
 
 
+@example({"a": {".Inf": None}})  # a text that YAML would read as a number which is refused
 @given(st.dictionaries(st.from_regex(r"[a-z]{1,12}", fullmatch=True), VALUES, min_size=1, max_size=4))
 def test_any_values_mean_the_same(settings: dict[str, object]) -> None:
     text = f"pano_mvs: 1\nstages:\n    a: {json.dumps({'use': 'x.y'} | settings)}\n"
