@@ -585,12 +585,15 @@ def test_a_unit_is_tried_again_so_often(toy: Toy, retries: int, code: int) -> No
     assert len(count.read_text()) == retries + 1
 
 
-EXAMPLES = re.findall(r"```yaml\n(.*?)```", REFERENCE.read_text(encoding="utf-8"), re.DOTALL)
+PAGE = REFERENCE.read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"(?<!<!-- group -->\n)```yaml\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.mark.parametrize("text", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_the_examples_of_the_reference_are_sound(text: str) -> None:
-    graph = wire(WorkflowReader("t", presets_folder(), Registry.installed(), presets=presets_folder()).read(text))
+def test_the_examples_of_the_reference_are_sound(text: str, tmp_path: Path) -> None:
+    for name, group in re.findall(r"Save this as `([^`]+)`:\n\n<!-- group -->\n```yaml\n(.*?)```", PAGE, re.DOTALL):
+        (tmp_path / name).write_text(group)
+    graph = wire(WorkflowReader("t", tmp_path, Registry.installed(), presets=presets_folder()).read(text))
     order = list(graph.order)
     if "levelled" in order:
         assert order.index("levelled") == order.index("refined") + 1
