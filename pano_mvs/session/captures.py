@@ -28,7 +28,7 @@ from pano_mvs.session.merging.block_runs import (
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.observers import observing
 from pano_mvs.session.progress import BlockStarted, Divided, EventLog, Progress, RunFinished
-from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
+from pano_mvs.session.python_calls import as_names, names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session, open_session
 
@@ -43,12 +43,12 @@ def run(
     cache: str | Path | None = None,
     executor: str | Execution = "",
     workers: int | None = None,
-    until: Sequence[str] = (),
-    only: Sequence[str] = (),
-    refresh: Sequence[str] = (),
+    until: str | Sequence[str] = (),
+    only: str | Sequence[str] = (),
+    refresh: str | Sequence[str] = (),
     keep_going: bool = False,
     progress: Progress | None = None,
-    observers: Mapping[str, Sequence[str]] | None = None,
+    observers: Mapping[str, str | Sequence[str]] | None = None,
     block_size: int | None = None,
     block_overlap: int = 0,
     block_loop: bool = False,
@@ -78,9 +78,10 @@ def run(
         executor: `processes` (the default), `serial` (in this process, for debugging) or that of a plugin, such as
             `dask`; or an `Execution`, for other settings, such as those of a queueing system.
         workers: number of units at a time; None for one per core, if memory permits.
-        until: run only these stages and those that they need.
+        until: run only these stages, or groups of stages, and those that they need. One name may be given as a text,
+            as for `only` and `refresh`.
         only: run only these units, as `STAGE:ITEM`, and those that they need.
-        refresh: stages or units to recompute even if they are cached.
+        refresh: stages, groups or units to recompute even if they are cached.
         keep_going: continue after failures even if a stage has `on_error: stop`.
         progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
         observers: name of each observer of a plugin that is to receive the events, to the values of its option, such
@@ -97,7 +98,9 @@ def run(
         InputError: if the images cannot be read.
         StoreError: if the cache or the output folder cannot be written.
     """
-    run_options = RunOptions(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
+    run_options = RunOptions(
+        as_names(until), as_names(only), as_names(refresh), accept_code=False, keep_going=keep_going
+    )
     session = open_session(
         workflow,
         overrides=overrides_from_settings(settings or {}),
@@ -110,7 +113,7 @@ def run(
     execution = replace(execution, workers=workers or execution.workers)
     poses = None if block_poses is None else Path(block_poses)
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=poses)
-    wanted = {name: tuple(values) for name, values in (observers or {}).items()}
+    wanted = {name: as_names(values) for name, values in (observers or {}).items()}
     return run_open_session(session, execution, decision, observers=wanted, progress=progress or ignore)
 
 

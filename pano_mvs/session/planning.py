@@ -25,7 +25,7 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.stage import is_only_planned
 from pano_mvs.scene import Axis
 from pano_mvs.session.progress import Forecast
-from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
+from pano_mvs.session.python_calls import as_names, names_arguments, overrides_from_settings
 from pano_mvs.session.session import Session, check_output, open_session
 
 
@@ -92,9 +92,9 @@ def plan(
     *,
     settings: Mapping[str, object] | None = None,
     cache: str | Path | None = None,
-    until: Sequence[str] = (),
-    only: Sequence[str] = (),
-    refresh: Sequence[str] = (),
+    until: str | Sequence[str] = (),
+    only: str | Sequence[str] = (),
+    refresh: str | Sequence[str] = (),
 ) -> RunPlan:
     """Return what `run` would compute with the same arguments; nothing is computed or written.
 
@@ -113,7 +113,7 @@ def plan(
         images=images,
         cache=cache,
         out=out,
-        run_options=RunOptions(tuple(until), tuple(only), tuple(refresh)),
+        run_options=RunOptions(as_names(until), as_names(only), as_names(refresh)),
     )
     check_output(session)
     return plan_session(session)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import PurePath
 from typing import ParamSpec, TypeVar
@@ -54,7 +54,16 @@ def arguments_from_options(message: str) -> str:
 
 
 def _argument(option: str) -> str:
-    return option.replace("-", "_")
+    return "metrics" if option == "metric" else option.replace("-", "_")
+
+
+def as_names(names: str | Iterable[str]) -> tuple[str, ...]:
+    """Return the names in an argument; a text is one name.
+
+    >>> as_names("depth"), as_names(["depth", "cloud"])
+    (('depth',), ('depth', 'cloud'))
+    """
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def overrides_from_settings(settings: Mapping[str, object]) -> list[str]:

@@ -27,12 +27,13 @@ from pano_mvs.engine.running.events import ignore
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
 from pano_mvs.engine.stages.params import files_of, key_fields
 from pano_mvs.engine.workflows.resolved import resolved_yaml
+from pano_mvs.results.origin import ORIGIN, Origin
 from pano_mvs.results.summary import INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.session.captures import is_early, run_open_session
 from pano_mvs.session.observers import OBSERVERS
 from pano_mvs.session.planning import plan_session
 from pano_mvs.session.progress import Progress
-from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
+from pano_mvs.session.python_calls import as_names, names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import DEFAULT_OPTIONS, RunOptions, Session, check_output, open_session
 from pano_mvs_experiments.grid import (
@@ -62,7 +63,7 @@ from pano_mvs_experiments.vary_results import (
 )
 
 VARY_JSON, VARY_CSV, VARY_HTML = "vary.json", "vary.csv", "vary.html"
-_OWN_FILES = {VARY_JSON, VARY_CSV, VARY_HTML, OUTPUT_MARK, LOCK_NAME}
+_OWN_FILES = {VARY_JSON, VARY_CSV, VARY_HTML, OUTPUT_MARK, LOCK_NAME, ORIGIN}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -440,6 +441,7 @@ def run_experiment(
     make_folder(out)
     with output_lock(out):
         write_text(out / OUTPUT_MARK, "")
+        Origin("vary").write(out)
         _write(variation_of(experiment, done))
         for idx, run in enumerate(experiment.runs):
             try:
@@ -581,15 +583,15 @@ def vary(
     file: str | Path | None = None,
     settings: Mapping[str, object] | None = None,
     seeds: int = 1,
-    metrics: Sequence[str] = (),
+    metrics: str | Sequence[str] = (),
     best: str = "",
     cache: str | Path | None = None,
     executor: str | Execution = "",
     workers: int | None = None,
-    until: Sequence[str] = (),
+    until: str | Sequence[str] = (),
     stop: bool = False,
     progress: Progress | None = None,
-    observers: Mapping[str, Sequence[str]] | None = None,
+    observers: Mapping[str, str | Sequence[str]] | None = None,
 ) -> Variation:
     """Run a workflow with each combination of settings, and return the results; cached results are reused.
 
@@ -610,7 +612,7 @@ def vary(
         settings: settings of all runs, as in `pano_mvs.run`.
         seeds: number of seeds of each combination, from 1.
         metrics: STAGE.METRIC, or a metric of a run (`METRICS`); empty for the scores if there is truth, else for the
-            default.
+            default. One name may be given as a text, as for `until`.
         best: `METRIC[:max|min]` by which the best combination is chosen.
         cache: see `pano_mvs.run`, as for `executor`, `workers`, `until` and `observers`.
         stop: whether the first run that does not finish is the last.
@@ -639,10 +641,10 @@ def vary(
         settings={target: Value(text, f"--set {target}") for target, _, text in fixed},
         combinations=found,
         seeds=seeds,
-        metrics=tuple(metrics),
+        metrics=as_names(metrics),
         best=best,
         cache=None if cache is None else Path(cache),
-        run_options=RunOptions(until=tuple(until)),
+        run_options=RunOptions(until=as_names(until)),
     )
     execution = executor if isinstance(executor, Execution) else Execution(executor)
     execution = replace(execution, workers=workers or execution.workers)
@@ -651,5 +653,5 @@ def vary(
     def around(_number: int, _run: PlannedRun) -> Iterator[Progress]:
         yield progress or ignore
 
-    wanted = {name: tuple(values) for name, values in (observers or {}).items()}
+    wanted = {name: as_names(values) for name, values in (observers or {}).items()}
     return run_experiment(prepare(request), execution, Watch(around), observers=wanted, stop=stop)

@@ -139,6 +139,62 @@ def test_settings_that_do_not_vary_are_in_all_runs(toy: Toy, pano_mvs: Command) 
     assert [each["name"] for each in results(toy)["combinations"]] == ["by=2", "by=3"]
 
 
+def test_groups_of_stages_are_compared(toy: Toy, pano_mvs: Command) -> None:
+    (toy.folder / "once.yaml").write_text("pano_mvs: 1\nstages: {scaled: {use: toy.scale, by: 3}}\n")
+    (toy.folder / "twice.yaml").write_text(
+        "pano_mvs: 1\nstages: {first: {use: toy.scale, by: 2}, scaled: {use: toy.scale, by: 5}}\n"
+    )
+    toy.edit("wf.yaml", lambda text: text.replace("scaled:     {use: toy.scale, by: 3}", "scaling: {group: once.yaml}"))
+    both = f"scaling.group={toy.folder / 'once.yaml'},{toy.folder / 'twice.yaml'}"
+    done = vary(pano_mvs, toy, "--set", both, "--metric", "scaled.value")
+    assert done.code == 0, done.text
+    found = json.loads((toy.folder / "v" / "vary.json").read_text())
+    assert found["varied"] == ["scaling.group"]
+    once, twice = (each["metrics"]["scaled.value"]["mean"] for each in found["combinations"])
+    assert twice == 2 * once
+    wrong = vary(pano_mvs, toy, "--set", "scaling.group=nothing.yaml,once.yaml")
+    assert (wrong.code, "no shipped group 'nothing.yaml'" in wrong.flat) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("names", "what"),
+    [
+        ({"metrics": "x"}, r"metrics=x: write STAGE\.METRIC, or one of registered"),
+        ({"until": "x"}, r"there is no stage 'x' in this workflow; it has: images"),
+        ({"grid": {"scaled.by": "23"}}, r"grid\['scaled.by'\]: must be a list of values"),
+        ({"grid": {"scaled.yb": [2]}}, r"grid\['scaled.yb'\]: stage 'scaled': unknown setting 'yb'\. Known: by, use"),
+        ({"grid": {"sclaed.by": [2]}}, r"grid\['sclaed.by'\]: no stage 'sclaed'\. Did you mean 'scaled'"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_anything_runs(toy: Toy, names: dict[str, Any], what: str) -> None:
+    """A text was taken for a list of letters."""
+    with pytest.raises((UsageError, WorkflowError), match=what):
+        pano_mvs.vary(
+            toy.folder / "wf.yaml",
+            out=toy.folder / "w",
+            cache=toy.folder / "wc",
+            **({"grid": {"scaled.by": [2]}} | names),
+        )
+    assert not (toy.folder / "w").exists()
+    assert not (toy.folder / "wc").exists()
+
+
+def test_one_name_may_be_a_text(toy: Toy) -> None:
+    found = pano_mvs.vary(
+        *(toy.folder / "wf.yaml", (), toy.folder / "w"),
+        grid={"scaled.by": [2, 3]},
+        metrics="scaled.value",
+        until="scaled",
+        cache=toy.folder / "cache",
+        executor="serial",
+    )
+    assert found.metrics == ("scaled.value",)
+    stages = json.loads((found.runs[0].out / "run.json").read_text())["stages"]
+    assert [stage["name"] for stage in stages] == ["images", "scaled"]
+    plan = pano_mvs.plan(toy.folder / "wf.yaml", cache=toy.folder / "cache", until="scaled", refresh="images")
+    assert [stage.name for stage in plan.stages] == ["images", "scaled"]
+
+
 def test_equal_combinations_are_named_and_left_out(toy: Toy, pano_mvs: Command) -> None:
     done = vary(pano_mvs, toy, "--set", "scaled.by=3,3.0,4,4")
     assert done.code == 0, done.text
