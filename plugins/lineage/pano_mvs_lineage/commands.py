@@ -57,6 +57,8 @@ def runs(
     console.show(shown)
     if hidden:
         console.say(f"{hidden} more settings differ; --csv FILE and --json list them")
+    for note in table.notes:
+        console.say(f"note: {escape(note)}")
     for why_not in table.skipped:
         console.say(f"left out: {escape(why_not)}")
 

@@ -95,6 +95,7 @@ class RunDiff:
             same = "the same settings, images, code and files"
             return [f"{same}, as far as they could be compared:" if self.notes else same, *self.notes]
         parts: list[tuple[str, list[str]]] = [
+            ("notes", list(self.notes)),
             ("outcome", list(map(str, self.outcome))),
             ("stages", list(map(str, self.stages))),
             ("settings", list(map(str, self.settings))),
@@ -105,7 +106,6 @@ class RunDiff:
             ("poses", _pose_lines(self.poses)),
             ("ranges", [str(one) for one in self.ranges]),
             ("files", _file_lines(self.files)),
-            ("notes", list(self.notes)),
         ]
         return [line for title, found in parts if found for line in (f"{title}:", *(f"  {each}" for each in found))]
 
@@ -133,20 +133,20 @@ def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = No
     root = None if cache is None else Path(cache)
     old, new = StoredRun.open(first, root), StoredRun.open(second, root)
     notes = [*old.notes, *(note for note in new.notes if note not in old.notes)]
-    notes += [note for run in (old, new) if (note := _missing_files(run))]
+    notes += [note for run in (old, new) for note in (run.unlisted, _missing_files(run)) if note]
     images = _images(old, new)
-    if not set.intersection(*map(set, _named(old, new))):
-        notes.append("the runs have no image in common, so that poses and ranges are not compared")
+    if note := _different_captures(old, new):
+        notes.insert(0, note)
     poses = _poses(old, new)
     return RunDiff(
         before=first,
         after=second,
         stages=_changes(_uses(old), _uses(new)),
         settings=_changes(*_common_settings(old, new)),
-        versions=_changes(old.summary.versions, new.summary.versions),
+        versions=_listed(old.summary.versions, new.summary.versions),
         reasons=reasons_between(old, new),
         images=images,
-        metrics=tuple(change for change in _changes(old.metrics, new.metrics) if not _is_close(change)),
+        metrics=tuple(change for change in _listed(old.metrics, new.metrics) if not _is_close(change)),
         poses=poses,
         ranges=range_changes(old, new),
         files=_changes(old.summary.files, new.summary.files),
@@ -266,7 +266,27 @@ def _below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
 
 
 def _images(old: StoredRun, new: StoredRun) -> tuple[Change, ...]:
-    return _changes(*_named(old, new))
+    return _listed(*_named(old, new))
+
+
+def _listed(before: Mapping[str, Any], after: Mapping[str, Any]) -> tuple[Change, ...]:
+    """Return the changes, or none if a run of an earlier version lists nothing of the kind."""
+    return _changes(before, after) if before and after else ()
+
+
+def _different_captures(old: StoredRun, new: StoredRun) -> str:
+    """Return a note if two runs have no image in common, by name or by content; "" if they have, or do not list any."""
+    before, after = _named(old, new)
+    if not before or not after:
+        return ""
+    if not before.keys() & after.keys():
+        return "the runs are of different captures: they have no image in common, and poses and ranges are not compared"
+    if not {*before.values()} & {*after.values()}:
+        return (
+            "the runs are probably of different captures: no image of theirs is the same, although some have the same "
+            "name. Metrics, poses and ranges then do not compare"
+        )
+    return ""
 
 
 def _missing_files(run: StoredRun) -> str:

@@ -6,13 +6,14 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.text import finite_or_none, shortened_list
 from pano_mvs.results.figures import median
+from pano_mvs.session.python_calls import as_names
 from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
 
 _SCORES = ("median_pair_error_deg", "registered")
@@ -56,10 +57,11 @@ class RunTable:
     settings: tuple[str, ...]  # `STAGE.SETTING`, in the order of the workflows
     metrics: tuple[str, ...]  # `STAGE.METRIC` or a score, as chosen
     skipped: tuple[str, ...] = ()  # why runs are missing
+    notes: tuple[str, ...] = ()  # such as that runs are of different captures
 
     def to_json(self) -> dict[str, Any]:
         """Return the table as JSON values."""
-        return {"runs": [row.to_json() for row in self.rows], "skipped": list(self.skipped)}
+        return {"runs": [row.to_json() for row in self.rows], "skipped": list(self.skipped), "notes": list(self.notes)}
 
     @property
     def headings(self) -> tuple[str, ...]:
@@ -84,7 +86,7 @@ class RunTable:
 
 
 def runs(
-    folders: str | Path | Iterable[str | Path] = "out", *, metrics: Sequence[str] = (), sort: str = ""
+    folders: str | Path | Iterable[str | Path] = "out", *, metrics: str | Sequence[str] = (), sort: str = ""
 ) -> RunTable:
     """Return the runs in some folders: what differs in their settings, and what came of it.
 
@@ -110,13 +112,28 @@ def runs(
     if not found:
         raise InputError("no run can be read:\n  " + "\n  ".join(skipped))
     settings = differing([run.settings for run in found])
-    chosen = tuple(metrics) or _scores_of(found)
+    chosen = as_names(metrics) or _scores_of(found)
     known = sorted({name for run in found for name in _values_of(run)})
     for name in chosen:
         if name not in known:
             raise UsageError(f"no run has the metric {name!r}; there are: {shortened_list(known, 20)}")
-    table = RunTable(tuple(_row(run, settings, chosen) for run in found), settings, chosen, tuple(skipped))
+    rows = tuple(_row(run, settings, chosen) for run in found)
+    table = RunTable(rows, settings, chosen, tuple(skipped), _captures(found))
     return _sorted(table, sort)
+
+
+def _captures(found: Sequence[StoredRun]) -> tuple[str, ...]:
+    """Return a note if the runs are of captures without an image in common, and one on runs that list no images."""
+    captures: list[tuple[set[str], StoredRun]] = []
+    for run in found:
+        own = set(run.summary.inputs.values())
+        if own and not any(own & images for images, _ in captures):
+            captures.append((own, run))
+    notes = [run.unlisted for run in found if run.unlisted]
+    if len(captures) > 1:
+        shown = shortened_list([f"{run.summary.source_folder} ({run.out})" for _, run in captures])
+        notes.append(f"the runs are of {len(captures)} different captures, whose metrics do not compare: {shown}")
+    return tuple(notes)
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -182,4 +199,4 @@ def _sorted(table: RunTable, sort: str) -> RunTable:
             return (1, 0.0, text) if text else (2, 0.0, "")
 
     rows = sorted(table.rows, key=place, reverse=sort.startswith("-"))
-    return RunTable(tuple(rows), table.settings, table.metrics, table.skipped)
+    return replace(table, rows=tuple(rows))

@@ -121,6 +121,18 @@ class StoredRun:
                 yield item, record
 
     @property
+    def unlisted(self) -> str:
+        """A note on what run.json does not list; "" if it lists all."""
+        found = {"images": self.summary.inputs, "versions of libraries": self.summary.versions}
+        lacking = " and no ".join(what for what, values in found.items() if not values)
+        if not lacking:
+            return ""
+        return (
+            f"{self.out}: its run.json lists no {lacking}, which are not compared: an earlier version of pano_mvs "
+            "wrote it, or the run ended early. Run the workflow again to add them"
+        )
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Each setting as `STAGE.SETTING`, and the stage behind each name as `STAGE.use`."""
         found: dict[str, Any] = {}

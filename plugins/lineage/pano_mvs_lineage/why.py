@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,15 +12,19 @@ from typing import Any
 
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.file_names import is_of_the_run
 from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.text import plural, shortened_list
+from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.running.publish import delivered_files
+from pano_mvs.results.origin import ORIGIN, Origin, RunName
 from pano_mvs.results.summary import RUN_JSON
+from pano_mvs.scene.files import item_stems
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions, reopen
 from pano_mvs_lineage.diff import digests_in
 from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
-
-_BY_THE_RUN = ("run.json", "report.html")
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class UnitOrigin:
     libraries: Mapping[str, str]
     seconds: float  # that it took
     depth: int = 0  # number of units between it and the file
+    group: str = ""  # the group of stages that its stage belongs to
 
     @property
     def label(self) -> str:
@@ -47,8 +53,8 @@ class FileOrigin:
     """Where a file comes from."""
 
     file: Path
-    name: str  # of the file in the output folder of its run
-    out: Path
+    name: str  # of the file in the output folder of its run, or in that of the command that made it
+    out: Path  # the output folder of its run, or of the first run that it was made from
     workflow: str
     started: str
     version: str  # of pano_mvs
@@ -56,6 +62,7 @@ class FileOrigin:
     images: Mapping[str, str]  # path of each image that it depends on to its digest; of the whole run if unknown
     was_changed: bool = False  # whether the file has other bytes than the run wrote
     notes: tuple[str, ...] = ()
+    command: str = ""  # the command that made the file from runs, such as `share`; empty if a run wrote it
 
     def to_json(self) -> dict[str, Any]:
         """Return the origin as JSON values."""
@@ -63,18 +70,21 @@ class FileOrigin:
 
     def lines(self) -> list[str]:
         """Return the origin as text."""
+        what = f"made by pano-mvs {self.command} from" if self.command else f"{self.name} of"
         lines = [
-            f"{self.file}: {self.name} of the run into {self.out}",
-            f"workflow {self.workflow}, started {self.started}, pano_mvs {self.version}",
+            f"{self.file}: {what} the run into {self.out}",
+            f"workflow {self.workflow}, started {self.started or 'at an unknown time'}, pano_mvs {self.version}",
         ]
         if self.was_changed:
             lines.append("the file has other bytes than the run wrote: it was changed since")
         for unit in self.units:
             settings = ", ".join(f"{name}={value}" for name, value in unit.settings.items()) if unit.depth == 0 else ""
-            lines.append(f"{'  ' * min(unit.depth, 1)}{unit.label} ({unit.use}), {unit.seconds:.2f} s, {unit.key[:12]}")
+            use = f"{unit.use}, in {unit.group}" if unit.group else unit.use
+            lines.append(f"{'  ' * min(unit.depth, 1)}{unit.label} ({use}), {unit.seconds:.2f} s, {unit.key[:12]}")
             lines += [f"  settings: {settings}"] if settings else []
             lines += [f"  code: {unit.code}"] if unit.depth == 0 and unit.code else []
-        lines.append(f"images: {', '.join(Path(path).name for path in self.images)}")
+        images = ", ".join(Path(path).name for path in self.images)
+        lines.append(f"images: {images or 'run.json does not list them'}")
         return [*lines, *self.notes]
 
 
@@ -84,7 +94,8 @@ def why(
     """Return where a delivered file comes from: its run, the unit that made it, and all that this depends on.
 
     A file in the output folder of a run is found by its place. One that was copied elsewhere is found by its content
-    among the runs in the folders `runs`.
+    among the runs in the folders `runs`. A file of a shared page or an experiment leads to the runs that it was made
+    from, which are looked for there as well.
 
     >>> import pano_mvs
     >>> pano_mvs.why("out/range/000.tiff").units[0].label  # doctest: +SKIP
@@ -101,13 +112,17 @@ def why(
     if not is_file(path):
         raise InputError(f"{path}: there is no such file. Give a file that a run has written")
     root = None if cache is None else Path(cache)
-    place = _run_above(path)
+    place = _folder_above(path)
+    made_by = Origin.read(place) if place is not None and not is_file(place / RUN_JSON) else None
+    if place is not None and made_by is not None:
+        return _derived(path, place, made_by, as_paths(runs) if runs else [], root)
     if place is not None:
         run, name = StoredRun.open(place, root), path.absolute().relative_to(place.absolute()).as_posix()
         if name in run.summary.files:
             return _origin(path, name, run, was_changed=digest_from_file(path) != run.summary.files[name])
-        if name in _BY_THE_RUN:
-            note = f"{name} is written at the end of each run, from the results of all stages"
+        if is_of_the_run(name):
+            when = "during" if name.startswith("logs/") else "at the end of"
+            note = f"{name} is written by the run itself, {when} each run, from the results of all stages"
             return _origin(path, name, run, note=note)
         if not runs:
             raise InputError(f"{path}: the run into {place} has not written this file, or an earlier run has")
@@ -142,9 +157,8 @@ def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
         InputError: if the workflow or the images of the run are no longer there.
     """
     if not origin.units:
-        raise UsageError(
-            f"{origin.file}: the unit that made it is not known, because the cache of the run is not there"
-        )
+        why_not = "; ".join(origin.notes) or "the cache of the run is not there"
+        raise UsageError(f"{origin.file}: there is no unit to compute again: {why_not}")
     unit = origin.units[0]
     session = reopen(str(origin.out), overrides=[], images=None, cache=None if cache is None else Path(cache))
     before = StoredRun.open(origin.out, session.store_root).record(unit.stage, unit.item)
@@ -166,10 +180,59 @@ def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
     return Repeated(unit.label, before.output.digest == after.output.digest, seconds)
 
 
-def _run_above(path: Path) -> Path | None:
-    """Return the output folder of the run in which a file lies, or None."""
+def _folder_above(path: Path) -> Path | None:
+    """Return the output folder of the run in which a file lies, or of a command that made files from runs, or None."""
     folders = path.absolute().parents
-    return next((folder for folder in folders if is_file(folder / RUN_JSON)), None)
+    return next((folder for folder in folders if is_file(folder / RUN_JSON) or is_file(folder / ORIGIN)), None)
+
+
+def _derived(path: Path, folder: Path, origin: Origin, searched: list[Path], root: Path | None) -> FileOrigin:
+    """Return the origin of a file that a command made from runs.
+
+    Args:
+        searched: folders in which the runs are looked for; if there is none, the current folder, or the folder of the
+            file if its runs lie below it.
+
+    Raises:
+        InputError: if none of the runs is found.
+    """
+    below = searched or ([Path()] if origin.runs else [folder])
+    runs = [run for run in _readable(below, root) if not origin.runs or RunName.of(run.summary) in origin.runs]
+    if not runs:
+        which = ", ".join(f"{run.workflow}, started {run.started}" for run in origin.runs)
+        raise InputError(
+            f"{path}: pano-mvs {origin.command} made this file, but no run that it was made from is in "
+            f"{shortened_list(list(map(str, below)))}{f' ({which})' if which else ''}. Name its folder with --runs"
+        )
+    first = runs[0]
+    images = {image: digest for run in runs for image, digest in run.summary.inputs.items()}
+    outs = shortened_list([str(run.out) for run in runs])
+    note = f"made from {len(runs)} {plural(len(runs), 'run')}: {outs}; ask about a file of a run for its units"
+    name = path.absolute().relative_to(folder).as_posix()
+    return FileOrigin(
+        path,
+        name,
+        first.out,
+        workflow=first.summary.workflow.name,
+        started=first.summary.started,
+        version=first.summary.version,
+        units=(),
+        images=images,
+        notes=(note,),
+        command=origin.command,
+    )
+
+
+def _readable(folders: list[Path], root: Path | None) -> Iterator[StoredRun]:
+    """Yield the runs in some folders, without those that cannot be read."""
+    for folder in folders:
+        try:
+            outs = find_runs([folder])
+        except InputError:
+            continue
+        for out in outs:
+            with suppress(InputError):
+                yield StoredRun.open(out, root)
 
 
 def _origin(path: Path, name: str, run: StoredRun, *, was_changed: bool = False, note: str = "") -> FileOrigin:
@@ -177,7 +240,7 @@ def _origin(path: Path, name: str, run: StoredRun, *, was_changed: bool = False,
     notes = [*run.notes, *([note] if note else [])]
     units: tuple[UnitOrigin, ...] = ()
     if not note:
-        found = _maker(run, summary.files[name])
+        found = _maker(run, name)
         if found is None and run.store is not None:
             notes.append("the cache no longer has the unit that made it")
         units = tuple(_with_sources(run, *found)) if found is not None else ()
@@ -196,18 +259,40 @@ def _is_one_of(path: str, items: Iterable[str]) -> bool:
     return any(place == item or place.endswith(f"/{item}") for item in items)
 
 
-def _maker(run: StoredRun, digest: str) -> tuple[str, str, UnitRecord] | None:
-    """Return the stage, the item and the record of the unit that delivered a file with a digest."""
-    for stage in run.keys:
-        for item, record in run.records(stage):
-            if any(part.digest == digest for part in record.output.parts.values()):
-                return stage, item, record
-    return None
+def _maker(run: StoredRun, name: str) -> tuple[str, str, UnitRecord] | None:
+    """Return the stage, the item and the record of the unit that delivered a file; None if the cache lacks it.
+
+    Several units may have made the same bytes: an image that is copied unchanged is also that of the source.
+    """
+    digest = run.summary.files[name]
+    same = [
+        (stage, item, record)
+        for stage in run.keys
+        for item, record in run.records(stage)
+        if any(part.digest == digest for part in record.output.parts.values())
+    ]
+    sources = [outcome.name for outcome in run.summary.stages if outcome.use.startswith("source.")]
+    stems = item_stems(dict.fromkeys(item for stage in sources for item in run.keys.get(stage, {})))
+    return next((one for one in same if _delivers(run, one, name, stems)), same[0] if same else None)
+
+
+def _delivers(run: StoredRun, unit: tuple[str, str, UnitRecord], name: str, stems: Mapping[str, str]) -> bool:
+    """Return whether a unit delivers a file, in the folder of its stage or elsewhere."""
+    _, item, record = unit
+    if run.store is None:
+        return False
+    try:
+        targets = [target for target, _ in delivered_files(record.output, run.store)]
+    except DamagedBlobError:  # it delivers no files
+        return False
+    placed = (target.replace("{item}", stems.get(item, item)).replace("{name}", item) for target in targets)
+    return any(name == target or name.endswith(f"/{target}") for target in placed)
 
 
 def _with_sources(run: StoredRun, stage: str, item: str, record: UnitRecord) -> Iterator[UnitOrigin]:
     """Yield a unit and all units that it depends on, the nearest first."""
     uses = {outcome.name: outcome.use for outcome in run.summary.stages}
+    groups = {outcome.name: outcome.group for outcome in run.summary.stages}
     pending, seen = [(stage, item, record, 0)], {(stage, item)}
     while pending:
         name, unit, made, depth = pending.pop(0)
@@ -222,6 +307,7 @@ def _with_sources(run: StoredRun, stage: str, item: str, record: UnitRecord) -> 
             dict(identity.get("libraries") or {}),
             made.seconds,
             depth,
+            groups.get(name, ""),
         )
         for port, value in (identity.get("inputs") or {}).items():
             for digest in digests_in(value):

@@ -176,6 +176,92 @@ def test_runs_are_compared_without_their_cache_too(two: tuple[Toy, Path, Path]) 
     assert any("is not there" in note for note in why(next(first.glob("*.txt"))).notes)
 
 
+def as_earlier_version(out: Path) -> None:
+    """Take from run.json what early versions did not write."""
+    value = json.loads((out / "run.json").read_text())
+    value["schema"] = 0
+    for key in ("inputs", "versions", "started"):
+        del value[key]
+    for stage in value["stages"]:
+        del stage["group"], stage["unit_seconds"]
+    (out / "run.json").write_text(json.dumps(value))
+
+
+def test_a_run_of_an_earlier_version_is_compared_by_what_it_lists(two: tuple[Toy, Path, Path]) -> None:
+    """What it does not list was reported as a difference: no version and no image was the same."""
+    toy, first, second = two
+    as_earlier_version(second)
+    found = diff(first, second)
+    assert [str(change) for change in found.settings] == ["scaled.by: 3 → 4"]
+    assert (found.images, found.versions) == ((), ())
+    (note,) = [note for note in found.notes if "lists no images and no versions of libraries" in note]
+    assert note.startswith(f"{second}: its run.json")
+    assert found.lines()[:1] == ["notes:"]
+    assert found.reasons["scaled"] == "setting by: 3 → 4"
+    table = runs([toy.folder / "runs"])
+    assert table.notes == (note,)
+    assert [row.out for row in table.rows if not row.started] == [second]
+    lines = why(second / next(iter(package.load(second).summary.files))).lines()
+    assert "started at an unknown time" in lines[1]
+    assert "images: run.json does not list them" in lines
+
+
+@pytest.mark.parametrize("what", ["run.json", "files", "records", "runs", "blobs"])
+def test_a_run_that_was_half_deleted_is_compared_as_far_as_possible(
+    two: tuple[Toy, Path, Path], pano_mvs: Command, what: str
+) -> None:
+    toy, first, second = two
+    name = next(iter(package.load(second).summary.files))
+    if what == "run.json":
+        (second / "run.json").write_bytes((second / "run.json").read_bytes()[:100])
+        for words in (("diff", first, second), ("why", second / name)):
+            done = pano_mvs(*words)
+            assert (done.code, "is not a valid run.json" in done.flat) == (2, True)
+        assert [row.out for row in runs([toy.folder / "runs"]).rows] == [first]
+        return
+    if what == "files":
+        for each in package.load(second).summary.files:
+            (second / each).unlink()
+    else:
+        shutil.rmtree(toy.folder / "cache" / what)
+    found = diff(first, second)
+    assert [str(change) for change in found.settings] == ["scaled.by: 3 → 4"]
+    assert len(runs([toy.folder / "runs"]).rows) == 2
+    if what == "files":
+        assert any(f"no longer in {second}: " in note for note in found.notes)
+        done = pano_mvs("why", second / name)
+        assert (done.code, "there is no such file" in done.flat) == (2, True)
+        return
+    origin = why(second / name)
+    assert origin.units or origin.notes, "there is a clear line"
+    if what == "runs":
+        assert any("contains no run into" in note for note in found.notes)
+
+
+def test_runs_of_different_captures_are_named(two: tuple[Toy, Path, Path], pano_mvs: Command) -> None:
+    """Images of the same names were compared as if they were of one capture."""
+    toy, first, _ = two
+    for path in list((toy.folder / "capture").iterdir()):
+        toy.number(path.name, f"{float(path.read_text()) + 100}")
+    third = run_into(toy, "third")
+    found = diff(first, third)
+    assert found.notes[0].startswith("the runs are probably of different captures: no image of theirs is the same")
+    assert found.lines()[1] == f"  {found.notes[0]}"
+    (note,) = runs([toy.folder / "runs"]).notes
+    assert note.startswith("the runs are of 2 different captures, whose metrics do not compare: ")
+    assert f"note: {note}" in pano_mvs("runs", toy.folder / "runs").flat
+    for path in list((toy.folder / "capture").iterdir()):
+        path.rename(path.with_name(f"other_{path.name}"))
+    fourth = run_into(toy, "fourth")
+    assert diff(first, fourth).notes[0].startswith("the runs are of different captures: they have no image in common")
+    assert diff(first, two[2]).notes == runs([first, two[2]]).notes == ()
+
+
+def test_a_text_is_one_metric(two: tuple[Toy, Path, Path]) -> None:
+    toy, _, _ = two
+    assert runs(toy.folder / "runs", metrics="scaled.value").metrics == ("scaled.value",)
+
+
 def test_a_file_leads_back_to_its_unit_and_to_the_images(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
     toy, first, _ = two
     name = next(name for name in package.load(first).summary.files)

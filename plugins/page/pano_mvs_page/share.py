@@ -20,6 +20,7 @@ from pano_mvs.core.yaml_text import parse_yaml
 from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.results.colors import probability_color
 from pano_mvs.results.figures import share as share_text
+from pano_mvs.results.origin import Origin, RunName
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import FilePart
@@ -135,6 +136,7 @@ def share_run(
     cameras = [camera.cam_from_world for camera in shown.cameras]
     frame = page_from_world(cameras, is_level=shown.is_level)
     page = PageFolder(folder)
+    Origin("share", (RunName.of(run.summary),)).write(folder)
     source = resolved(run.summary.source_folder or run.out)
     # The name of the folder of the capture, which may hold its images in `images`; else of the output.
     title = options.title or (source.parent if source.name == "images" else source).name
