@@ -22,6 +22,7 @@ NOTHING_TO_SEE = {
     "installation.md": "commands",
     "plugins.md": "code",
     "running.md": "processes, caches and texts on the terminal",
+    "tutorials/settings.md": "tables of the terminal",
     "tutorials/cluster.md": "commands on a cluster",
     "workflows.md": "YAML files",
 }
