@@ -169,11 +169,21 @@ def plugin_new(
     ],
     name: Annotated[str, typer.Argument(help="Name of the plugin: lower-case letters, digits and '_'.")],
     folder: Annotated[Path, typer.Option("--dir", help="Folder for the file and its test.")] = Path(),
+    environment: Annotated[
+        str,
+        typer.Option(
+            "--environment",
+            metavar="KIND",
+            help="Write a package, NAME, that asks for a Python environment of its own: overlay or isolated.",
+            show_default=False,
+        ),
+    ] = "",
 ) -> None:
     """Write a working plugin, NAME.py, and its test, test_NAME.py."""
     from pano_mvs.cli.plugins.new import write_plugin
 
-    write_plugin(kind, name, folder, commands=context.find_root().command, console=Console())
+    commands = context.find_root().command
+    write_plugin(kind, name, folder, commands=commands, console=Console(), environment=environment)
 
 
 @plugin_app.command("kinds")
