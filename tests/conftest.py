@@ -35,6 +35,7 @@ if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4 << 30:
     tempfile.tempdir = None  # pytest has asked for the folder already
 # What whoever runs the tests has among their own plugins is no part of them.
 os.environ["PANO_MVS_PLUGINS"] = ""
+os.environ["PANO_MVS_ENVIRONMENTS"] = ""
 
 # Neither the commands nor what is installed changes during the tests. It takes 15 ms to make the commands, which each
 # `CliRunner` would do anew, and 5 ms to look for plugins among 160 installed packages, as each session does.

@@ -22,6 +22,12 @@ def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Pat
     variable = environment.get(PLUGINS_VARIABLE)
     if variable is not None:
         return [Path(folder) for folder in variable.split(os.pathsep) if folder]
+    settings = user_settings_folder(environment)
+    return [] if settings is None else [settings / "plugins"]
+
+
+def user_settings_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
+    """Return the folder of the user's settings of pano_mvs, which need not exist; None for a user without a home."""
     home = home_folder()
     if sys.platform == "win32":
         given = Path(environment.get("APPDATA") or "")
@@ -31,7 +37,7 @@ def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Pat
     else:
         given = Path(environment.get("XDG_CONFIG_HOME") or "")
         settings = given if given.is_absolute() else home and home / ".config"
-    return [] if settings is None else [settings / "pano-mvs" / "plugins"]
+    return None if settings is None else settings / "pano-mvs"
 
 
 def plugin_files_in(folder: Path) -> list[Path]:

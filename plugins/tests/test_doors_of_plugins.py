@@ -18,7 +18,7 @@ KEPT = [
     *observer_contract_tests("notify", values=["json://127.0.0.1:9"]),
     *reader_contract_tests("tour"),
     *reader_contract_tests("video"),
-    *(one for name in ("crate", "cache.push", "cache.pull") for one in command_contract_tests(name)),
+    *(one for name in ("crate", "cache.push", "cache.pull", "plugin.remove") for one in command_contract_tests(name)),
 ]
 
 
@@ -35,6 +35,11 @@ def test_bundled_plugins_have_a_row_each(pano_mvs: Command) -> None:
         "bundled",
         "ok",
         "commands cache.pull, cache.push; executors dask, lsf, pbs, sge, slurm",
+    ]
+    assert found["pano_mvs_environments"] == [
+        "bundled",
+        "ok",
+        "commands plugin.install, plugin.remove; functions install_plugin, plugin_environments, remove_plugin",
     ]
     assert found["pano_mvs_records"] == ["bundled", "ok", "command crate; observers notify, otel"]
     assert found["pano_mvs_video"] == ["bundled", "ok", "stage source.video; capture reader video"]

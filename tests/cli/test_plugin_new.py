@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pano_mvs.cli.plugins.new import EXAMPLES, KINDS, rendered
+from pano_mvs.cli.plugins.new import EXAMPLES, KINDS, rendered, rendered_package
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing import conformance
@@ -220,3 +221,34 @@ def test_kinds_are_listed(pano_mvs: Command) -> None:
     result = pano_mvs("plugin", "kinds")
     assert result.code == 0
     assert all(kind in result.text for kind in KINDS)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].prefix])
+def test_a_package_with_an_environment_of_its_own_has_the_stage_of_a_file(kind: str) -> None:
+    files = rendered_package(kind, "mine", "isolated")
+    assert files["mine/__init__.py"] == rendered(kind, "mine")[0]
+    project = tomllib.loads(files["pyproject.toml"])
+    assert project["project"]["name"] == "mine"
+    assert project["project"]["entry-points"] == {"pano_mvs.plugins": {"mine": "mine"}}
+    assert project["tool"]["pano_mvs"] == {"environment": "isolated"}
+    compile(files["test_mine.py"], "test_mine.py", "exec")
+
+
+def test_a_package_is_written_and_its_test_passes(pano_mvs: Command) -> None:
+    result = pano_mvs("plugin", "new", "filter", "mine", "--environment", "overlay", "--dir", "some where")
+    assert result.code == 0, result.text
+    assert "wrote the package some where/mine and its test" in result.flat
+    assert "pano-mvs plugin install 'some where/mine'" in result.flat
+    tests = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "some where/mine/test_mine.py"]
+    done = subprocess.run(tests, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    again = pano_mvs("plugin", "new", "filter", "mine", "--environment", "overlay", "--dir", "some where")
+    assert (again.code, "some where/mine already exists; nothing was written" in again.flat) == (2, True)
+
+
+def test_environments_are_for_stages(pano_mvs: Command) -> None:
+    result = pano_mvs("plugin", "new", "command", "mine", "--environment", "overlay")
+    assert (result.code, "brings stages: source, mask," in result.flat) == (2, True)
+    result = pano_mvs("plugin", "new", "filter", "mine", "--environment", "own")
+    assert (result.code, "--environment own: must be overlay or isolated" in result.flat) == (2, True)
+    assert not list(Path().iterdir())

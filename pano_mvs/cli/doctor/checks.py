@@ -23,7 +23,7 @@ from pano_mvs.core.paths import below, children, is_folder
 from pano_mvs.core.plugin_folders import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.registry import Plugin, PluginProblem, Registry
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 State: TypeAlias = Literal["ok", "note", "warning", "failed"]
@@ -42,7 +42,7 @@ class Finding:
 
 
 KNOWN_VARIABLES = (
-    *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE"),
+    *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_ENVIRONMENTS"),
     "PANO_MVS_WORKER",  # marks what a worker starts
 )
 
@@ -210,6 +210,15 @@ def _state(needed: Sequence[_Requirement], version_of: VersionOf) -> tuple[State
     return "ok", ", ".join(versions)
 
 
+def environment_finding(plugin: Plugin, problem: PluginProblem | None) -> Finding:
+    """Return whether the stages of a plugin can be computed in its own environment."""
+    if problem is not None:
+        return Finding("plugins", plugin.origin, "warning", problem.text, problem.remedy)
+    count = len(plugin.names)
+    detail = f"{count} {plural(count, 'stage')} in an environment of its own, {plugin.environment}"
+    return Finding("plugins", plugin.origin, "ok", detail)
+
+
 _BUILTIN = "source.folder"
 _REINSTALL = "pip install --force-reinstall pano-mvs"
 
@@ -230,9 +239,12 @@ def plugin_findings(
         yield Finding("plugins", "presets", "ok", ", ".join(workflows))
     else:
         yield Finding("plugins", "presets", "failed", f"no workflows in {presets}", _REINSTALL)
-    for plugin in registry.broken:
-        remedy = "correct or remove it; `pano-mvs plugins` shows more"
-        yield Finding("plugins", plugin.origin, "warning", f"failed to load: {plugin.error}", remedy)
+    for plugin in registry.plugins:
+        if plugin.check is not None:
+            yield environment_finding(plugin, plugin.check())
+        elif plugin.error:
+            remedy = "correct or remove it; `pano-mvs plugins` shows more"
+            yield Finding("plugins", plugin.origin, "warning", f"failed to load: {plugin.error}", remedy)
     for (kind, name), why in registry.clashes.items():
         yield Finding("plugins", f"{kind} {name}", "warning", why, "it cannot be used until this is resolved")
     for folder in user_plugin_folders(environment):

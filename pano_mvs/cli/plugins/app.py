@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,16 +11,18 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.commands import PluginGroup
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
-from pano_mvs.cli.console import Console
+from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.endings import guarded
 from pano_mvs.core.errors import UsageError, WorkflowError
 
 if TYPE_CHECKING:  # a command loads what it needs itself
+    from pano_mvs.cli.plugins.listing import PluginRow
     from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.engine.stages.stage import StageSpec
 
-plugin_app = typer.Typer(help="Create plugins.", no_args_is_help=True)
+plugin_app = typer.Typer(cls=PluginGroup, help="Create and manage plugins.", no_args_is_help=True)
 stage_app = typer.Typer(help="Describe a stage.", no_args_is_help=True)
 
 WorkflowOption = Annotated[
@@ -37,31 +39,58 @@ FileOption = Annotated[
 def plugins(
     workflow: WorkflowOption = None,
     files: FileOption = None,
+    *,
     check: Annotated[
         bool,
         typer.Option("--check", help="Also load what plugins offer beside stages; exit code 2 if anything is broken."),
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """List all plugins with their origin, whether they can be loaded, and what they bring."""
-    from pano_mvs.cli.plugins.listing import broken_reasons, entry_problems, plugin_rows, plugin_table
+    from pano_mvs.cli.plugins.listing import broken_reasons, entry_problems, plugin_rows
 
-    console, (registry, _) = Console(), _registry(workflow, files or [])
+    registry, _ = _registry(workflow, files or [])
     problems = entry_problems(check=check)
-    console.show(plugin_table(plugin_rows(registry, problems)))
+    rows, broken = plugin_rows(registry, problems), broken_reasons(registry, problems)
+    if as_json:
+        _print_plugins(rows, registry, broken)
+    else:
+        _show_plugins(rows, registry, broken)
+    if check and (broken or registry.clashes):
+        raise typer.Exit(UsageError.exit_code)
+
+
+def _print_plugins(rows: Mapping[str, PluginRow], registry: Registry, broken: Sequence[str]) -> None:
+    """Print all plugins as JSON."""
+    stages = [
+        {"stage": name, "version": spec.version, "from": registry.origins[name], "summary": _summary(spec)}
+        for name, spec in sorted(registry.stages.items())
+    ]
+    plugins = [row.to_json(origin) for origin, row in rows.items()]
+    problems = [*registry.clashes.values(), *dict.fromkeys(broken)]
+    print_json({"plugins": plugins, "stages": stages, "problems": problems})
+
+
+def _show_plugins(rows: Mapping[str, PluginRow], registry: Registry, broken: Sequence[str]) -> None:
+    """Print all plugins as tables, and what is wrong with them."""
+    from pano_mvs.cli.plugins.listing import plugin_table
+
+    console = Console()
+    console.show(plugin_table(rows))
     table = Table("stage", "version", "from", "")
     for name, spec in sorted(registry.stages.items()):
-        doc = spec.doc.splitlines()[0] if spec.doc else ""
-        table.add_row(name, str(spec.version), escape(registry.origins[name]), escape(doc))
+        table.add_row(name, str(spec.version), escape(registry.origins[name]), escape(_summary(spec)))
     console.show(table)
     for (kind, name), mark in sorted(registry.registrations.items()):
         console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
     for clash in registry.clashes.values():
         console.say(f"[red]twice:[/] {escape(clash)}")
-    broken = broken_reasons(registry, problems)
     for reason in dict.fromkeys(broken):
         console.say(f"[red]broken:[/] {escape(reason)}")
-    if check and (broken or registry.clashes):
-        raise typer.Exit(UsageError.exit_code)
+
+
+def _summary(spec: StageSpec) -> str:
+    return spec.doc.splitlines()[0] if spec.doc else ""
 
 
 @stage_app.command("show")
@@ -140,11 +169,21 @@ def plugin_new(
     ],
     name: Annotated[str, typer.Argument(help="Name of the plugin: lower-case letters, digits and '_'.")],
     folder: Annotated[Path, typer.Option("--dir", help="Folder for the file and its test.")] = Path(),
+    environment: Annotated[
+        str,
+        typer.Option(
+            "--environment",
+            metavar="KIND",
+            help="Write a package, NAME, that asks for a Python environment of its own: overlay or isolated.",
+            show_default=False,
+        ),
+    ] = "",
 ) -> None:
     """Write a working plugin, NAME.py, and its test, test_NAME.py."""
     from pano_mvs.cli.plugins.new import write_plugin
 
-    write_plugin(kind, name, folder, commands=context.find_root().command, console=Console())
+    commands = context.find_root().command
+    write_plugin(kind, name, folder, commands=commands, console=Console(), environment=environment)
 
 
 @plugin_app.command("kinds")

@@ -26,9 +26,10 @@ _LISTED = 3  # more stages than these are counted
 class PluginRow:
     """A plugin, as `pano-mvs plugins` shows it."""
 
-    source: str  # "built in", "bundled", "installed" or "file"
+    source: str  # "built in", "bundled", "installed", "environment" or "file"
     brings: dict[str, list[str]] = field(default_factory=dict)  # kind to names
     broken: bool = False  # whether it, or something that it offers, cannot be loaded
+    environment: str = ""  # the folder of its own environment, if it has one
 
     def add(self, kind: str, name: str) -> None:
         """Add a name, which may be there already."""
@@ -38,13 +39,26 @@ class PluginRow:
 
     @property
     def text(self) -> str:
-        """What it brings, in words."""
-        return "; ".join(
+        """What it brings, in words, and where its environment is."""
+        brings = "; ".join(
             f"{len(names)} stages"
             if kind == "stage" and len(names) > _LISTED
             else f"{plural(len(names), kind)} {', '.join(names)}"
             for kind, names in self.brings.items()
         )
+        return f"{brings}; in {self.environment}" if self.environment else brings
+
+    def to_json(self, origin: str) -> dict[str, Any]:
+        """Return the row as a JSON value."""
+        state = "broken" if self.broken else "ok"
+        brings = {kind: list(names) for kind, names in self.brings.items()}
+        return {
+            "plugin": origin,
+            "from": self.source,
+            "environment": self.environment or None,
+            "state": state,
+            "brings": brings,
+        }
 
 
 def plugin_rows(registry: Registry, problems: Mapping[tuple[str, str], str]) -> dict[str, PluginRow]:
@@ -56,7 +70,8 @@ def plugin_rows(registry: Registry, problems: Mapping[tuple[str, str], str]) -> 
     rows: dict[str, PluginRow] = {}
     sources = {origin_of(entry): _source(entry) for _, _, entry in _entries()}
     for plugin in registry.plugins:
-        row = rows.setdefault(plugin.origin, PluginRow(sources.get(plugin.origin, "file")))
+        source = "environment" if plugin.environment else sources.get(plugin.origin, "file")
+        row = rows.setdefault(plugin.origin, PluginRow(source, environment=plugin.environment))
         row.broken |= bool(plugin.error)
         for kind, name in plugin.names:
             row.add(kind, name)

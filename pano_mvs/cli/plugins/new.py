@@ -1,4 +1,4 @@
-"""Write a new plugin: a working file of some kind, and its test."""
+"""Write a new plugin: a working file of some kind, and its test; or a package with an environment of its own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -100,8 +101,29 @@ EXAMPLES = {
 """A file that the plugin of a kind reads, with `{name}` for its name."""
 
 
+ENVIRONMENTS = ("overlay", "isolated")
+"""The kinds of environments of its own that a plugin may ask for."""
+
+
 def rendered(kind: str, name: str) -> tuple[str, str]:
     """Return the text of a new plugin and that of its test."""
+    plugin, test = _rendered(kind, name, f"{kind}.py", "test.py")
+    return plugin, test
+
+
+def rendered_package(kind: str, name: str, environment: str) -> dict[str, str]:
+    """Return the files of a new plugin with an environment of its own: paths in its folder to their texts."""
+    if environment not in ENVIRONMENTS:
+        raise UsageError(f"--environment {environment}: must be {' or '.join(ENVIRONMENTS)}")
+    if kind in KINDS and not KINDS[kind].prefix:
+        stages = ", ".join(name for name, one in KINDS.items() if one.prefix)
+        raise UsageError(f"a plugin with an environment of its own brings stages: {stages}, but no {kind}")
+    plugin, test, project = _rendered(kind, name, f"{kind}.py", "test.py", "pyproject.toml", environment=environment)
+    return {f"{name}/__init__.py": plugin, f"test_{name}.py": test, "pyproject.toml": project}
+
+
+def _rendered(kind: str, name: str, *templates: str, environment: str = "") -> list[str]:
+    """Return the texts of some templates for a new plugin."""
     if kind not in KINDS:
         raise UsageError(f"unknown kind of plugin {kind!r}; known kinds: {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
@@ -110,7 +132,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         )
     if name in sys.stdlib_module_names or name in _installed():
         raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package with that name")
-    environment = Environment(
+    texts = Environment(
         loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
         undefined=StrictUndefined,
         keep_trailing_newline=True,
@@ -124,11 +146,10 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         "contract_tests": KINDS[kind].contract_tests,
         "prefix": KINDS[kind].prefix,
         "example": EXAMPLES.get(kind, "").format(name=name),
+        "environment": environment,
+        "what": KINDS[kind].what.capitalize(),
     }
-    return (
-        environment.get_template(f"{kind}.py.jinja").render(values),
-        environment.get_template("test.py.jinja").render(values),
-    )
+    return [texts.get_template(f"{template}.jinja").render(values) for template in templates]
 
 
 @cache  # takes a third of a second
@@ -136,28 +157,38 @@ def _installed() -> frozenset[str]:
     return frozenset(packages_distributions())
 
 
-def write_plugin(kind: str, name: str, folder: Path, *, commands: Any, console: Console) -> None:
+def write_plugin(kind: str, name: str, folder: Path, *, commands: Any, console: Console, environment: str = "") -> None:
     """Write a new plugin and its test into a folder, and print how to use it.
 
     Args:
         commands: the group of all built-in commands, as typer runs it.
+        environment: that the plugin asks for, which is then a package in a folder of its own; empty for a file.
     """
-    plugin, test = rendered(kind, name)
+    if environment:
+        files = {f"{name}/{path}": text for path, text in rendered_package(kind, name, environment).items()}
+    else:
+        files = dict(zip((f"{name}.py", f"test_{name}.py"), rendered(kind, name), strict=True))
     if (full := f"{KINDS[kind].prefix}.{name}".removeprefix(".")) in _taken(kind, commands):
         what = "observer or option" if kind == "observer" else kind.replace("_", " ")
         raise UsageError(f"{full} exists already as another {what}; nothing was written. Choose another name")
-    paths = folder / f"{name}.py", folder / f"test_{name}.py"
-    for path in paths:
+    for path in [folder / name, *(folder / path for path in files)] if environment else map(folder.joinpath, files):
         if exists(path):
             raise UsageError(f"{path} already exists; nothing was written. Choose another name or another --dir")
-    for path, text in zip(paths, (plugin, test), strict=True):
-        write_given(path, text, f"--dir {folder}")
-    console.say(f"wrote {escape(str(paths[0]))} and its test")
+    for written, text in files.items():
+        write_given(folder / written, text, f"--dir {folder}")
+    paths = [folder / path for path in files]
     use = KINDS[kind].use.format(name=name)
-    if KINDS[kind].in_workflow:
+    if environment:
+        console.say(f"wrote the package {escape(str(folder / name))} and its test")
+        console.say("state what it needs in its pyproject.toml, install it, and use it in a workflow:")
+        console.say(f"  pano-mvs plugin install {escape(quote(str(folder / name)))}")
+        console.print(f"  stages:\n    {use}", highlight=False, markup=False)
+    elif KINDS[kind].in_workflow:
+        console.say(f"wrote {escape(str(paths[0]))} and its test")
         console.print("use it in a workflow:", highlight=False)
         console.print(f"  plugins: [{name}.py]\n  stages:\n    {use}", highlight=False, markup=False)
     else:
+        console.say(f"wrote {escape(str(paths[0]))} and its test")
         console.say(f"use it: put {name}.py into a folder that ${PLUGINS_VARIABLE} names, and run")
         console.print(f"  {use}", highlight=False, markup=False, soft_wrap=True)
     console.say(f"test it: pytest {escape(str(paths[1]))}")

@@ -15,6 +15,7 @@ from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import WORKER_BYTES, available_threads, share_cores
+from pano_mvs.engine.stages.stage import RemoteStage
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class SerialExecutor(Executor):
         self.threads = self.cores = threads or available_threads()
         self._store = store
         self._jobs: list[Job] = []
+        self._remotes: list[RemoteStage] = []
 
     def submit(self, job: Job) -> None:
         """Keep a job for `wait`."""
@@ -73,6 +75,8 @@ class SerialExecutor(Executor):
         if not self._jobs or timeout_s == 0:
             return None
         job = self._jobs.pop(0)
+        if (remote := job.unit.entry.spec.remote) is not None and remote not in self._remotes:
+            self._remotes.append(remote)
         return job.number, unit_outcome(job.unit, self._store, threads=job.threads, log=job.log)
 
     def cancel(self) -> None:
@@ -80,7 +84,10 @@ class SerialExecutor(Executor):
         self._jobs.clear()
 
     def close(self) -> None:
-        """Do nothing."""
+        """End the processes of stages whose code is elsewhere."""
+        for remote in self._remotes:
+            remote.close()
+        self._remotes.clear()
 
 
 def _serial(store: Store, request: ExecutorRequest) -> Executor:

@@ -302,6 +302,9 @@ def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
 
 def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
     """Run a unit with its output in `log`, store its result, and return how it ended."""
+    if (remote := unit.entry.spec.remote) is not None:
+        there: JobOutcome = remote.outcome(unit, store, threads=threads, log=log)
+        return there
     started = time.perf_counter()
     try:
         make_folder(log.parent)

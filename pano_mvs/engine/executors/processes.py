@@ -13,10 +13,11 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pano_mvs.core.files import make_folder, temporary_prefix
@@ -137,20 +138,34 @@ class ProcessExecutor(Executor):
 _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from pano_mvs.engine.executors.worker import main; main()"
 )
+_BOOT_THERE = "from pano_mvs.engine.executors.worker import main; main()"
 
 
 class WorkerProcess:
     """A process that computes one unit at a time; it is started for the first one."""
 
-    def __init__(self, threads: int, errors: Path, *, units: int = UNITS_PER_PROCESS) -> None:
+    def __init__(
+        self,
+        threads: int,
+        errors: Path,
+        *,
+        units: int = UNITS_PER_PROCESS,
+        python: Sequence[str] = (),
+        variables: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         """Prepare a worker.
 
         Args:
             threads: the most threads that a unit may use.
             errors: file for what the process prints outside units, such as why it cannot start.
             units: the most units of one process; the next unit gets another one.
+            python: another interpreter with its options, in which pano_mvs is installed; by default this one, with
+                the same path.
+            variables: what is different in the environment of the process.
         """
         self._units = units
+        self._python = tuple(python)
+        self._variables = variables
         self.threads = threads
         self.errors = errors
         self.served = 0  # number of units that the present process has received
@@ -201,13 +216,15 @@ class WorkerProcess:
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._mark = uuid.uuid4().hex
-        environment = {**os.environ, MARK: self._mark}
+        environment = {**os.environ, **self._variables, MARK: self._mark}
         bound_environment(environment, self.threads)
         path = json.dumps([place for place in sys.path if place])  # "" would mean the current folder
+        same = [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path]
+        command = [*self._python, "-X", "faulthandler", "-c", _BOOT_THERE] if self._python else same
         self.served, self.refused, self._ready, self._too_late = 0, False, False, False
         with self.errors.open("wb") as errors:
             self._process = subprocess.Popen(  # noqa: S603 (our own code)
-                [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path],
+                command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,

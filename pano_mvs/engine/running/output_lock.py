@@ -6,8 +6,6 @@ two runs in a folder.
 
 from __future__ import annotations
 
-import errno
-import importlib
 import json
 import os
 import socket
@@ -18,9 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
-
-if os.name == "posix":
-    import fcntl
+from pano_mvs.core.locks import try_lock
 
 LOCK_NAME = ".pano-mvs-lock"
 
@@ -65,7 +61,7 @@ def is_run_gone(out: Path) -> bool:
     except OSError:
         return False
     try:
-        return _lock(handle) is True
+        return try_lock(handle) is True
     finally:
         os.close(handle)
 
@@ -74,7 +70,7 @@ def _acquired(path: Path) -> int:
     """Return the handle of the file, locked."""
     for _ in range(10):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        if _lock(handle) is not False:
+        if try_lock(handle) is not False:
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(handle), path.stat()):  # else its owner has just removed it
                     return handle
@@ -89,18 +85,3 @@ def _acquired(path: Path) -> int:
         f"another run is writing into {path.parent}{who}. Wait until it has ended, or choose another folder with "
         "--out DIR"
     )
-
-
-def _lock(handle: int) -> bool | None:
-    """Lock a file, and return whether that was possible; None if the file system has no locks."""
-    try:
-        if os.name == "posix":
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        else:
-            windows = importlib.import_module("msvcrt")
-            os.lseek(handle, 1 << 20, os.SEEK_SET)  # what is locked cannot be read
-            windows.locking(handle, windows.LK_NBLCK, 1)
-            os.lseek(handle, 0, os.SEEK_SET)
-    except OSError as error:
-        return False if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
-    return True

@@ -9,13 +9,15 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
+from inspect import isfunction
 from pathlib import Path
 from types import ModuleType
+from typing import TypeAlias
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.doors import load_entry, origin_of
@@ -30,6 +32,19 @@ from pano_mvs.engine.stages.stage_code import code_digest
 
 ENTRY_POINT_GROUP = "pano_mvs.plugins"
 _OF_THE_RUN = ("command", "executor", "observer")  # registrations that no worker needs
+_Named: TypeAlias = tuple[tuple[str, str], StageSpec | Registration]  # kind and name, and what has them
+
+
+@dataclass(frozen=True, slots=True)
+class PluginProblem:
+    """Why the environment of a plugin cannot be used."""
+
+    text: str
+    remedy: str
+
+    def __str__(self) -> str:
+        """Return both in one sentence each."""
+        return f"{self.text}. {self.remedy[:1].upper()}{self.remedy[1:]}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +54,24 @@ class Plugin:
     origin: str  # the distribution, or the file
     names: tuple[tuple[str, str], ...]  # what it defines: ("stage", name), or the kind and name of a registration
     error: str = ""  # why it could not be loaded, in one line; empty if it was loaded
-    trace: str = ""  # the traceback of that error
+    trace: str = ""  # the traceback of that error; empty if the error says what to do
+    environment: str = ""  # the folder of its own environment; empty if it is imported into this process
+    # tries its own environment, and returns why its stages cannot be computed there; None if they can
+    check: Callable[[], PluginProblem | None] | None = None
 
     def why_broken(self) -> str:
         """Return why none of its names can be used."""
+        if not self.trace:
+            return f"the plugin {self.origin} cannot be used: {self.error}"
         return f"the plugin {self.origin} failed to load:\n{self.trace.rstrip()}"
+
+
+@dataclass(frozen=True, slots=True)
+class ProvidedPlugin:
+    """A plugin whose stages are not in a module of this process."""
+
+    plugin: Plugin
+    stages: tuple[StageSpec, ...] = ()  # none if it cannot be used
 
 
 @dataclass(slots=True)
@@ -81,7 +109,7 @@ class Registry:
         Raises:
             PluginError: if a name is defined elsewhere too; the message names both places.
         """
-        if clashes := self._clashes(module, own_only=bool(code)):
+        if clashes := self._clashes(_defined(module, own_only=bool(code))):
             raise PluginError("; ".join(clashes.values()))
         self._add(module, origin, code)
 
@@ -134,6 +162,9 @@ class Registry:
         """Return a hint for an unknown stage name: similar names, and the plugins that could not be loaded."""
         if ("stage", name) in self.clashes:
             return self.clashes["stage", name]
+        for plugin in self.broken:
+            if ("stage", name) in plugin.names:
+                return plugin.why_broken()
         close = get_close_matches(name, self.stages, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(map(repr, close))}?" if close else "`pano-mvs plugins` lists all stages"
         return "\n".join([hint, *(plugin.why_broken() for plugin in self.broken)])
@@ -142,9 +173,12 @@ class Registry:
         origin = origin_of(entry)
         try:
             module = load_entry(entry)
+            if isfunction(module):
+                self._add_provided(module())
+                return
             if not isinstance(module, ModuleType):
-                raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
-            clashes = self._clashes(module, own_only=False)
+                raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module or a function")
+            clashes = self._clashes(_defined(module, own_only=False))
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -153,6 +187,13 @@ class Registry:
         self.clashes |= clashes
         self._add(module, origin, "")
         self.plugins.append(Plugin(origin, _names(module, own_only=False)))
+
+    def _add_provided(self, provided: Iterable[ProvidedPlugin]) -> None:
+        """Add plugins whose stages are not in a module."""
+        for one in provided:
+            self.clashes |= self._clashes((("stage", spec.name), spec) for spec in one.stages)
+            self._add_stages(one.stages, one.plugin.origin)
+            self.plugins.append(one.plugin)
 
     def _load_folder(self, folder: Path) -> None:
         if not folder.is_absolute():
@@ -167,16 +208,16 @@ class Registry:
                 continue
             if loaded is not None:
                 module, digest = loaded
-                self.clashes |= self._clashes(module, own_only=True)
+                self.clashes |= self._clashes(_defined(module, own_only=True))
                 self._add(module, str(path), digest)
                 self._remember_file(path, module, digest)
 
-    def _clashes(self, module: ModuleType, *, own_only: bool) -> dict[tuple[str, str], str]:
-        """Return the names of a module that are defined elsewhere too, with both places."""
+    def _clashes(self, defined: Iterable[_Named]) -> dict[tuple[str, str], str]:
+        """Return the names, as of a module, that are defined elsewhere too, with both places."""
         places = {key: found.origin for key, found in self.registrations.items()}
         places |= {("stage", name): spec.origin for name, spec in self.stages.items()}
         clashes: dict[tuple[str, str], str] = {}
-        for (kind, name), found in _defined(module, own_only=own_only):
+        for (kind, name), found in defined:
             taken = places.setdefault((kind, name), found.origin)
             if taken != found.origin:
                 both = f"{taken} and {found.origin}"
@@ -187,9 +228,14 @@ class Registry:
         for key, found in _defined(module, own_only=bool(code)):
             if isinstance(found, Registration):
                 self.registrations.setdefault(key, found)
-            elif found.name not in self.stages:
-                self.stages[found.name] = found.with_code(code) if code else found
-                self.origins[found.name] = origin
+            else:
+                self._add_stages([found.with_code(code) if code else found], origin)
+
+    def _add_stages(self, stages: Iterable[StageSpec], origin: str) -> None:
+        for spec in stages:
+            if spec.name not in self.stages:
+                self.stages[spec.name] = spec
+                self.origins[spec.name] = origin
 
     def _withhold(self) -> None:
         """Remove names that are defined twice, and state why others may be missing."""
@@ -219,7 +265,7 @@ def _names(module: ModuleType, *, own_only: bool) -> tuple[tuple[str, str], ...]
     return tuple(dict.fromkeys(key for key, _ in _defined(module, own_only=own_only)))
 
 
-def _defined(module: ModuleType, *, own_only: bool) -> Iterator[tuple[tuple[str, str], StageSpec | Registration]]:
+def _defined(module: ModuleType, *, own_only: bool) -> Iterator[_Named]:
     """Yield the stages of a module, then what it registers beside them, with kind and name; see `Plugin.names`.
 
     Args:

@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Generic, Literal, Protocol, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import PluginError
@@ -136,6 +136,27 @@ its params, the number of images and the bytes that it is expected to store."""
 
 
 @dataclass(frozen=True, slots=True)
+class StageCode:
+    """What the results of a stage depend on beside its settings and inputs."""
+
+    digest: str  # of the code
+    libraries: Mapping[str, str]  # name to version of the libraries that this code imports
+
+
+class RemoteStage(Protocol):
+    """A stage whose code is not imported into this process, such as that of a plugin in another environment."""
+
+    def code(self) -> StageCode:
+        """Return its code and the libraries there."""
+
+    def outcome(self, unit: Any, store: Any, *, threads: int, log: Path) -> Any:
+        """Compute a unit there, and return its outcome, as `executors.execute.unit_outcome` does."""
+
+    def close(self) -> None:
+        """End the processes that compute its units for this process."""
+
+
+@dataclass(frozen=True, slots=True)
 class StageSpec:
     """The declaration of a stage."""
 
@@ -160,6 +181,7 @@ class StageSpec:
     expected_units: ExpectedUnits | None = None
     # of a stage with one unit, whose memory grows with the capture; None if it does not
     expected_memory: ExpectedMemory | None = None
+    remote: RemoteStage | None = None  # where its code is, if it is not imported into this process
 
     @property
     def doc(self) -> str:
@@ -174,7 +196,7 @@ class StageSpec:
     @property
     def is_built_in(self) -> bool:
         """Whether the stage is one of the core or of a bundled plugin."""
-        return self.function.__module__.partition(".")[0] in own_packages()
+        return self.remote is None and self.function.__module__.partition(".")[0] in own_packages()
 
     @property
     def index_kind(self) -> type[Record] | None:

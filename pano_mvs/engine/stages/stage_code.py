@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -25,7 +25,7 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import checked_body, write_checked
 from pano_mvs.core.kernel_cache import user_cache_folder
 from pano_mvs.engine.stages.params import Params, registered_files
-from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage import StageCode, StageSpec
 
 _OURS = Path(pano_mvs.__file__).resolve().parent
 _LEFT_OUT = (
@@ -56,16 +56,10 @@ _Import: TypeAlias = tuple[int, str, Sequence[str]]  # level, module ("" for `fr
 _Parsed: TypeAlias = tuple[str, Sequence[_Import]]  # digest of what a module executes, and its imports
 
 
-@dataclass(frozen=True, slots=True)
-class StageCode:
-    """What the results of a stage depend on beside its settings and inputs."""
-
-    digest: str  # of the code
-    libraries: Mapping[str, str]  # name to version of the libraries that this code imports
-
-
 def stage_code(spec: StageSpec, params: Params) -> StageCode:
     """Return the code of a stage with given settings, which may hold names that plugins registered."""
+    if spec.remote is not None:
+        return spec.remote.code()
     module = spec.function.__module__
     file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
     if file.suffix != ".py":  # compiled, or entered interactively: only its version is known
@@ -77,6 +71,40 @@ def stage_code(spec: StageSpec, params: Params) -> StageCode:
         digests[setting] = found[-1][0]
     libraries = library_versions(name for _, names in found for name in names)
     return StageCode(digest_from_value(digests) if len(digests) > 1 else digests[""], libraries)
+
+
+@dataclass(frozen=True, slots=True)
+class PackageCode:
+    """The code of a module of an installed package, without that of pano_mvs, which another process may look up."""
+
+    files: Mapping[str, str]  # files of the package to the digests of what they execute
+    outer: tuple[str, ...]  # dotted names that these import from elsewhere
+
+
+def package_code(module: str) -> PackageCode:
+    """Return the code of a module, which is imported, of an installed package that is a plugin's.
+
+    A compiled module has no files: only its version is known.
+    """
+    file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+    if file.suffix != ".py":
+        return PackageCode({}, (module.partition(".")[0],))
+    found = _local_code(file)
+    return PackageCode(found.files, tuple(sorted(_outer_of(found, _Roots.of(file.resolve()), ""))))
+
+
+def code_of_package(code: PackageCode, version_of: Callable[[str], str]) -> StageCode:
+    """Return the code of a stage whose package this process does not import, with the code of pano_mvs in here.
+
+    It equals that of `stage_code` in a process that imports the package, and has the same pano_mvs and libraries.
+
+    Args:
+        version_of: returns the version of the library that provides a module.
+    """
+    if not code.files:
+        return StageCode("", library_versions(code.outer, version_of))
+    digest, names = _with_ours("", code.files, code.outer)
+    return StageCode(digest, library_versions(names, version_of))
 
 
 def code_digest(path: Path) -> str:
@@ -103,17 +131,19 @@ def code_texts(path: Path) -> tuple[str, dict[str, str]]:
     return roots.name_of(path.resolve()), texts
 
 
-def library_versions(modules: Iterable[str]) -> dict[str, str]:
+def library_versions(modules: Iterable[str], version_of: Callable[[str], str] | None = None) -> dict[str, str]:
     """Return the version of each library that affects results, by its display name.
 
     Args:
         modules: top-level names of the imported modules.
+        version_of: returns the version of the library that provides a module; by default `module_version`.
     """
-    return {_SHOWN_AS.get(module, module): _version(module) for module in sorted(set(modules) - _IGNORED)}
+    found = version_of or module_version
+    return {_SHOWN_AS.get(module, module): found(module) for module in sorted(set(modules) - _IGNORED)}
 
 
 @cache
-def _version(module: str) -> str:
+def module_version(module: str) -> str:
     """Return the version of the distribution of a module; tries the module's name first, which is faster."""
     for names in (lambda: _DISTRIBUTIONS.get(module, (module,)), lambda: packages_distributions().get(module, ())):
         found = []
@@ -133,19 +163,31 @@ def _code_of(path: Path, own_digest: str) -> tuple[str, frozenset[str]]:
         own_digest: of a plugin file, when it was loaded; empty for modules of installed packages.
     """
     found = _local_code(path)
-    files, outer = dict(found.files), set(found.outer)
     roots = _Roots.of(path.resolve())
-    if roots.package != _OURS:
-        if roots.package is not None and not own_digest and roots.package.name not in own_packages():
-            outer.add(roots.package.name)  # its version stands for its compiled modules
-        ours = _Roots(None, _OURS)
-        inner = _Code()
-        inner.collect([file for name in outer for file in ours.files(name)], ours)
-        files |= inner.files
-        outer |= inner.outer
+    if roots.package == _OURS:
+        return _digest_and_libraries(own_digest, found.files, found.outer)
+    return _with_ours(own_digest, found.files, _outer_of(found, roots, own_digest))
+
+
+def _outer_of(found: _Code, roots: _Roots, own_digest: str) -> set[str]:
+    """Return the names that code imports from elsewhere, and its own package, if it is one of a plugin."""
+    outer = set(found.outer)
+    if roots.package is not None and not own_digest and roots.package.name not in own_packages():
+        outer.add(roots.package.name)  # its version stands for its compiled modules
+    return outer
+
+
+def _with_ours(own_digest: str, files: Mapping[str, str], outer: Iterable[str]) -> tuple[str, frozenset[str]]:
+    """Return the digest of some code and of that of pano_mvs which it imports, and the libraries of both."""
+    ours, inner = _Roots(None, _OURS), _Code()
+    inner.collect([file for name in outer for file in ours.files(name)], ours)
+    return _digest_and_libraries(own_digest, {**files, **inner.files}, {*outer, *inner.outer})
+
+
+def _digest_and_libraries(own_digest: str, files: Mapping[str, str], outer: set[str]) -> tuple[str, frozenset[str]]:
     libraries = {name.partition(".")[0] for name in outer} - own_packages() - sys.stdlib_module_names
     _keep_parsed()
-    return digest_from_value([own_digest, files]), frozenset(libraries)
+    return digest_from_value([own_digest, dict(files)]), frozenset(libraries)
 
 
 def _local_code(path: Path) -> _Code:

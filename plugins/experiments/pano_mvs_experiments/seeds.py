@@ -27,9 +27,10 @@ def drawing_stages(workflow: Workflow) -> list[str]:
 def draws(spec: StageSpec) -> bool:
     """Return whether a stage draws random numbers: whether its code, or a function that takes its context, reads `rng`.
 
-    Functions are found by their names in the module of the stage.
+    Functions are found by their names in the module of the stage. If its code is in another environment, any stage
+    that takes a context may draw them.
     """
-    return "ctx" in spec.extras.values() and _reads_rng(spec.function, set())
+    return "ctx" in spec.extras.values() and (spec.remote is not None or _reads_rng(spec.function, set()))
 
 
 def _reads_rng(function: Callable[..., Any], seen: set[Callable[..., Any]]) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 from pano_mvs_experiments.seeds import drawing_stages, draws, seed_overrides
 
 from pano_mvs.engine.stages.registry import Registry
@@ -25,6 +28,13 @@ DRAWING = {
 
 def test_the_stages_that_draw_are_known() -> None:
     assert {name for name, spec in Registry.installed().stages.items() if draws(spec)} == DRAWING
+
+
+def test_code_in_another_environment_may_draw() -> None:
+    remote = SimpleNamespace(code=None, outcome=None, close=None)
+    elsewhere = [replace(spec, remote=remote) for spec in Registry.installed().stages.values()]
+    assert {spec.name for spec in elsewhere if draws(spec)} > DRAWING
+    assert all(draws(spec) == ("ctx" in spec.extras.values()) for spec in elsewhere)
 
 
 def test_a_function_that_takes_the_context_counts(toy: Toy) -> None:

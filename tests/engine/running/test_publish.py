@@ -12,6 +12,7 @@ import pytest
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK
+from pano_mvs.core.locks import try_lock
 from pano_mvs.core.processes import start_of
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running import output_lock as module
@@ -224,7 +225,7 @@ def test_a_file_that_names_nobody_is_no_obstacle(tmp_path: Path, text: bytes) ->
 def test_a_file_that_its_owner_has_just_removed_is_not_the_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock, calls = module._lock, []
+    lock, calls = try_lock, []
 
     def overtaken(handle: int) -> bool | None:
         calls.append(handle)
@@ -232,7 +233,7 @@ def test_a_file_that_its_owner_has_just_removed_is_not_the_lock(
             (tmp_path / LOCK_NAME).unlink()
         return lock(handle)
 
-    monkeypatch.setattr(module, "_lock", overtaken)
+    monkeypatch.setattr(module, "try_lock", overtaken)
     with output_lock(tmp_path):
         assert (tmp_path / LOCK_NAME).is_file()
     assert len(calls) == 2
@@ -264,7 +265,7 @@ def test_where_open_files_cannot_be_removed_the_file_is_closed_first(
 
 
 def test_a_file_system_without_locks_stops_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_lock", lambda _handle: None)
+    monkeypatch.setattr(module, "try_lock", lambda _handle: None)
     with output_lock(tmp_path):
         assert not is_run_gone(tmp_path)
 
