@@ -74,9 +74,11 @@ def build(folder: Path, source: PluginSource, mode: Mode) -> None:
     """
     uv = shutil.which("uv") if mode == "isolated" else None
     python = python_in(folder)
+    make_folder(folder)
+    (folder / MARK).touch()  # first, so that an interrupted installation is known as such
     try:
         if uv is not None:
-            run_command([uv, "venv", "--quiet", "--python", sys.executable, str(folder)])
+            run_command([uv, "venv", "--quiet", "--allow-existing", "--python", sys.executable, str(folder)])
         else:
             run_command([sys.executable, "-P", "-m", "venv", "--without-pip", str(folder)])
         _link(folder, mode)
@@ -93,7 +95,6 @@ def _link(folder: Path, mode: Mode) -> None:
     """Let an environment import pano_mvs, and, if it is an overlay, what else is installed here."""
     packages, place = Path(_place(folder, "purelib")), _place_of
     make_folder(packages)
-    (folder / MARK).touch()
     linked = {name: found for name in sorted(own_packages()) if (found := place(name))}
     behind = list(_behind()) if mode == "overlay" else []
     (packages / f"{_LINK}.py").write_text(_LINK_CODE.format(packages=linked, behind=behind), encoding="utf-8")

@@ -24,6 +24,7 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs_environments.build import build, installer, python_in
 from pano_mvs_environments.index import (
     FORMAT,
+    MARK,
     Environment,
     Mode,
     canonical,
@@ -123,10 +124,13 @@ def _new_folder(folder: Path, name: str) -> Iterator[Path]:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove environments that are not in the index: older ones, and those of interrupted installations."""
+    """Remove environments that are not in the index: older ones, and those of interrupted installations.
+
+    The user chooses the folder, which may hold other things: only what `build` has marked is removed.
+    """
     used = folders_in_use()
     for path in children(folder):
-        if is_folder(path) and path not in used:
+        if is_folder(path) and exists(path / MARK) and path not in used:
             remove_whole(path)
 
 

@@ -385,7 +385,7 @@ def test_an_isolated_environment_sees_pano_mvs_alone(tmp_path: Path, monkeypatch
     uv.parent.mkdir()
     uv.write_text(
         f'#!/bin/sh\necho "$@" >> {asked}\n'
-        f'if [ "$1" = venv ]; then exec {sys.executable} -m venv --without-pip "$5"; fi\n'
+        f'if [ "$1" = venv ]; then exec {sys.executable} -m venv --without-pip "$6"; fi\n'
     )
     uv.chmod(0o755)
     monkeypatch.setenv("PATH", str(uv.parent), prepend=os.pathsep)
@@ -394,7 +394,7 @@ def test_an_isolated_environment_sees_pano_mvs_alone(tmp_path: Path, monkeypatch
     build(folder, source, "isolated")
     python = python_in(folder)
     first, second = asked.read_text().splitlines()
-    assert first == f"venv --quiet --python {sys.executable} {folder}"
+    assert first == f"venv --quiet --allow-existing --python {sys.executable} {folder}"
     same = f"pano-mvs=={product.__version__}"
     assert second == f"pip install --quiet --python {python} {same} one @ {(tmp_path / 'one').as_uri()}"
     code = (

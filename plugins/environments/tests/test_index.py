@@ -288,5 +288,8 @@ def test_what_is_no_plugin_is_not_removed(noted: Environment) -> None:
     for name in ("numpy", "pano-mvs", "nothing"):
         with pytest.raises(UsageError, match=rf"no plugin '{name}' is installed as a package.* Known: noted"):
             remove_plugin(name)
+    others = environments_folder() / "documents"
+    others.mkdir(parents=True)
     assert remove_plugin("Noted").name == "noted"
     assert environments() == []
+    assert others.is_dir()  # the user may have chosen a folder that holds other things
