@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from pano_mvs.algorithms.poses.placement.places import Placement
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups
 from pano_mvs.algorithms.poses.verification.appearance import Appearance, Surroundings
 from pano_mvs.algorithms.poses.verification.arrangements import CHANCE_SHARE, is_better_arrangement, place_score
-from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Evidence, nearest_cameras
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_from_ray
 
@@ -84,7 +84,7 @@ def model_by_images(
     if many and best is not by_pairs:
         return best
     is_of_seed = False
-    for seed in _seeds(pairs, images, small):
+    for seed in ranked_by_images(pairs, images, small):
         model = PlacedModel(pairs)
         model.seed(*seed)
         found = _completed(model, images, small, adjust=adjust)
@@ -97,7 +97,7 @@ def model_by_images(
     return best
 
 
-def _seeds(pairs: Pairs, images: Collection[int], confirmation: Confirmation) -> list[Seed]:
+def ranked_by_images(pairs: Pairs, images: Collection[int], confirmation: Confirmation) -> list[Seed]:
     """Return pairs, each with the rank of the geometry to start from, that are confirmed most, best first.
 
     A good seed also has sufficient parallax and matches. No image is in more than two of them.
@@ -144,11 +144,9 @@ def _completed(
 ) -> tuple[PlacedModel, dict[int, str]]:
     """Return a model with all images of a group that the others confirm, and the reasons for those left out."""
     model.adjust(cameras=adjust and len(model.cameras) > 2)
-    left = set(images) - model.cameras.keys()
-    refused = extend_by_images(model, left, confirmation, adjust=adjust)
-    settle(model, adjust=adjust)
-    model.confirmed_ranges.clear()  # they belong to the cameras before the last adjustment
-    return model, {image: refused.get(image) or why_nothing(model, image) for image in sorted(left)}
+    growth = Growth(model, set(images) - model.cameras.keys(), confirmation, adjust)
+    growth.grow()
+    return growth.ended()
 
 
 def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmation, *, adjust: bool) -> dict[int, str]:
@@ -164,29 +162,67 @@ def extend_by_images(model: PlacedModel, left: set[int], confirmation: Confirmat
     Returns:
         Why images could not be added although their pairs suggest places.
     """
-    adjusted = len(model.cameras)
-    options: list[_Option] = []
-    changed = set(model.cameras)
-    maps: dict[int, NDArray[np.float32]] = {}
-    while True:
-        for camera in sorted(changed):
-            maps[camera] = confirmation.ranges(camera, model.cameras)
-            model.confirmed_ranges[camera] = ranges_of_key_points(maps[camera], model.pairs.bearings[camera])
-        options = _options(model, left, confirmation, maps=maps, known=options)
-        usable = [option for option in options if option.share >= CHANCE_SHARE]
-        best = max(usable, key=lambda option: (option.score, -option.image), default=None)
-        if best is None:
-            break
-        model.add(best.image, best.pose)
-        left.discard(best.image)
-        changed = {best.image} | {idx for idx in model.cameras if best.image in _nearest(model, idx)}
+    growth = Growth(model, left, confirmation, adjust)
+    growth.grow()
+    return growth.refused()
+
+
+@dataclass(eq=False)
+class Growth:
+    """A model that grows by images."""
+
+    model: PlacedModel
+    left: set[int]  # images that are not in it
+    confirmation: Confirmation
+    adjust: bool  # whether all cameras are adjusted as the model grows
+    options: list[_Option] = field(default_factory=list)  # places that were compared last
+    maps: dict[int, NDArray[np.float32]] = field(default_factory=dict)  # confirmed ranges of its cameras
+    changed: set[int] = field(default_factory=set)  # cameras whose maps are to be computed
+    adjusted: int = 0  # number of cameras when it was last adjusted
+
+    def __post_init__(self) -> None:
+        if not self.adjusted:
+            self.adjusted, self.changed = len(self.model.cameras), set(self.model.cameras)
+
+    def grow(self) -> None:
+        """Add images, the best one first, until no other is confirmed."""
+        while options := self.usable():
+            self.add(options[0])
+
+    def usable(self) -> list[_Option]:
+        """Return the places for further images at which these are confirmed more than by chance, best first."""
+        for camera in sorted(self.changed):
+            self.maps[camera] = self.confirmation.ranges(camera, self.model.cameras)
+            bearings = self.model.pairs.bearings[camera]
+            self.model.confirmed_ranges[camera] = ranges_of_key_points(self.maps[camera], bearings)
+        self.changed = set()
+        self.options = _options(self.model, self.left, self.confirmation, maps=self.maps, known=self.options)
+        usable = (option for option in self.options if option.share >= CHANCE_SHARE)
+        return sorted(usable, key=lambda option: (-option.score, option.image))
+
+    def add(self, option: _Option) -> None:
+        """Add an image at a place."""
+        model = self.model
+        model.add(option.image, option.pose)
+        self.left.discard(option.image)
+        self.changed = {option.image} | {idx for idx in model.cameras if option.image in _nearest(model, idx)}
         # The first cameras decide on all others.
-        if len(model.cameras) > 1.25 * adjusted or len(model.cameras) < 6:
-            model.adjust(cameras=adjust)
-            adjusted = len(model.cameras)
-            changed = set(model.cameras)
-    refused = {option.image for option in options}
-    return dict.fromkeys(refused, "at the places that its pairs suggest, other images confirm nothing of what it sees")
+        if len(model.cameras) > 1.25 * self.adjusted or len(model.cameras) < 6:
+            model.adjust(cameras=self.adjust)
+            self.adjusted = len(model.cameras)
+            self.changed = set(model.cameras)
+
+    def refused(self) -> dict[int, str]:
+        """Return why images could not be added although their pairs suggest places."""
+        why = "at the places that its pairs suggest, other images confirm nothing of what it sees"
+        return {option.image: why for option in self.options if option.image in self.left}
+
+    def ended(self) -> tuple[PlacedModel, dict[int, str]]:
+        """Return the model after all cameras were adjusted, and why images could not be added."""
+        refused = self.refused()
+        settle(self.model, adjust=self.adjust)
+        self.model.confirmed_ranges.clear()  # they belong to the cameras before the last adjustment
+        return self.model, {image: refused.get(image) or why_nothing(self.model, image) for image in sorted(self.left)}
 
 
 def ranges_of_key_points(ranges: NDArray[np.float32], bearings: FloatArray) -> FloatArray:
@@ -209,7 +245,12 @@ class _Option:
     sources: list[int]  # the nearest cameras
     appearance: Appearance  # of the image there
     pose: Rigid3  # refined on known points, as soon as it is swept
-    share: float = -1.0  # of what the image sees there, confirmed by these; negative if it was not swept
+    evidence: Evidence | None = None  # what these confirm of what the image sees there; None if it was not swept
+
+    @property
+    def share(self) -> float:
+        """The share that these confirm of what the image sees there; negative if it was not swept."""
+        return -1.0 if self.evidence is None else float(np.nan_to_num(self.evidence.share))
 
     @property
     def score(self) -> float:
@@ -264,8 +305,8 @@ def _options(
             for number, (option, refined) in enumerate(found):
                 if number < _SWEPT and option.share < 0:
                     pose = refined()
-                    share = float(np.nan_to_num(confirmation.share(option.image, pose, model.cameras)))
-                    option = replace(option, pose=pose, share=share)
+                    evidence = confirmation.evidence(option.image, pose, model.cameras)
+                    option = replace(option, pose=pose, evidence=evidence)
                 compared.append(option)
         if any(option.share >= CHANCE_SHARE for option in compared):
             break
