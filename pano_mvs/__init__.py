@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pano_mvs.results.run_output import RunOutput, RunView, load
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.captures import run
+    from pano_mvs.session.checking import WorkflowCheck, check, format_workflow
     from pano_mvs.session.planning import RunPlan, plan
 
 __version__ = "0.1.0"
@@ -33,8 +34,11 @@ __all__ = [
     "RunView",
     "StoreError",
     "UsageError",
+    "WorkflowCheck",
     "WorkflowError",
     "__version__",
+    "check",
+    "format_workflow",
     "load",
     "plan",
     "run",
@@ -51,7 +55,10 @@ _HOMES = {
     "RunView": "results.run_output",
     "StoreError": "core.errors",
     "UsageError": "core.errors",
+    "WorkflowCheck": "session.checking",
     "WorkflowError": "core.errors",
+    "check": "session.checking",
+    "format_workflow": "session.checking",
     "load": "results.run_output",
     "plan": "session.planning",
     "run": "session.captures",

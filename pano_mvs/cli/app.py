@@ -261,12 +261,19 @@ def check(
     watch: Annotated[
         bool, typer.Option("--watch", help="Check again after each change of its files, until Ctrl-C.")
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the mistakes and warnings as JSON.")] = False,
 ) -> None:
     """Check a workflow and report every mistake with its line and column."""
-    from pano_mvs.cli.check_command import check_workflow, watch_workflow
+    from pano_mvs.cli.check_command import check_workflow, print_checked, watch_workflow
 
+    if watch and as_json:
+        from pano_mvs.core.errors import UsageError
+
+        raise UsageError("--watch and --json cannot be combined: use one of them")
     if watch:
         watch_workflow(workflow, overrides or [], images)
+    elif as_json:
+        print_checked(workflow, overrides or [], images)
     else:
         check_workflow(workflow, overrides or [], images)
 
@@ -279,11 +286,16 @@ def format_files(
         bool, typer.Option("--check", help="Change no file; exit code 4 if one is not laid out.")
     ] = False,
     show_diff: Annotated[bool, typer.Option("--diff", help="Print what would change, and change no file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print which files have changed, or would, as JSON.")] = False,
 ) -> None:
     """Lay out workflow files: order of keys, one line for a stage where it fits, no needless quotes, all comments."""
     from pano_mvs.cli.format_command import format_workflows
 
-    raise typer.Exit(format_workflows(files, Console(), check=check_only, show=show_diff))
+    if as_json and show_diff:
+        from pano_mvs.core.errors import UsageError
+
+        raise UsageError("--diff and --json cannot be combined: use one of them")
+    raise typer.Exit(format_workflows(files, Console(), check=check_only, show=show_diff, as_json=as_json))
 
 
 @app.command()

@@ -7,13 +7,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import typer
 from rich.markup import escape
 
-from pano_mvs.cli.console import Console
+from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, PanoMvsError, UsageError, WorkflowError
 from pano_mvs.core.paths import stat_of
 from pano_mvs.core.text import plural
 from pano_mvs.engine.workflows.workflow import find_workflow
+from pano_mvs.session.checking import WorkflowCheck, problems_of
 from pano_mvs.session.session import open_session, presets_folder
 
 _INTERVAL_S = 0.5
@@ -41,6 +43,22 @@ def check_workflow(
         Console(stderr=True).say(f"[yellow]warning:[/] {escape(reason)}")
     count = len(session.workflow.stages)
     Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
+
+
+def print_checked(workflow: str, overrides: Sequence[str], images: Path | None) -> None:
+    """Check a workflow, and print what is wrong with it as JSON; the exit code is that of `check_workflow`.
+
+    Raises:
+        UsageError: if there is no such workflow.
+    """
+    try:
+        session = open_session(workflow, overrides=overrides, images=images)
+        found = WorkflowCheck(workflow, len(session.workflow.stages), warnings=tuple(session.workflow.warnings))
+    except (WorkflowError, InputError) as error:
+        found = WorkflowCheck(workflow, problems=tuple(problems_of(error)))
+    print_json(found.to_json())
+    if not found.ok:
+        raise typer.Exit(WorkflowError.exit_code)
 
 
 def watch_workflow(
@@ -81,5 +99,5 @@ def _time(path: Path) -> tuple[int, int] | None:
 
 
 def _print(error: PanoMvsError) -> None:
-    for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
+    for problem in problems_of(error):
         Console(stderr=True).say(f"[red]error:[/] {escape(problem)}")

@@ -8,19 +8,20 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from pano_mvs.cli.console import Console
+from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.files import write_given
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.workflows.formatted import formatted
 from pano_mvs.engine.workflows.workflow_file import read_text
 
 
-def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, show: bool) -> int:
+def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, show: bool, as_json: bool = False) -> int:
     """Lay out workflow files, and return 0, or 4 if `check` or `show` is set and a file is not laid out.
 
     Args:
         check: whether to change no file.
         show: whether to print what would change, and to change no file.
+        as_json: whether to print one JSON object instead: which files were not laid out as usual.
     """
     texts = {path: read_text(path).replace("\r\n", "\n") for path in paths}
     laid_out = {path: formatted(text, str(path)) for path, text in texts.items()}  # all, before one is written
@@ -37,11 +38,15 @@ def format_workflows(paths: Sequence[Path], console: Console, *, check: bool, sh
             console.say(escape("\n".join(lines)))
         elif not check:
             _write(path, made)
+    code = 4 if changed and (check or show) else 0
+    if as_json:
+        print_json({"files": [{"file": str(path), "changed": path in changed} for path in paths], "written": not check})
+        return code
     for path in changed:
         console.say(f"{escape(str(path))}: {'is not laid out as usual' if check or show else 'was laid out'}")
     if not changed:
         console.say(f"{len(paths)} laid out as usual already" if len(paths) > 1 else "laid out as usual already")
-    return 4 if changed and (check or show) else 0
+    return code
 
 
 def _write(path: Path, text: str) -> None:
