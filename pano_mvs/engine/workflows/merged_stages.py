@@ -172,6 +172,11 @@ class MergedStages:
             self.problems.add(node.value["description"].place, f"group {name!r}: description must be text")
         if not isinstance(node.value.get("stages", _NOTHING).value, dict | None):
             self.problems.add(node.value["stages"].place, f"group {name!r}: `stages:` must be a mapping of stage names")
+        elif "stages" in node.value and node.value["stages"].value is None and name in self._groups:
+            self.problems.add(
+                node.value["stages"].key_place,
+                f"group {name!r}: `stages:` is empty, which changes nothing; `{name}: null` removes the group",
+            )
         return len(self.problems.lines) == before
 
     def _read(self, file: WorkflowFile, name: str, node: Located) -> tuple[Mapping[str, Located], str]:

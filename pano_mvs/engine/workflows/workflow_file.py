@@ -217,6 +217,9 @@ class WorkflowFilesReader:
                 root.value["name"].place,
                 "name must consist of letters, digits, '-', '_' and '.', and be a valid folder name",
             )
+        description = root.value.get("description")
+        if description is not None and not isinstance(description.value, str):
+            self.problems.add(description.place, "description must be text")
         node = root.value.get("stages")
         missing = node is None and "extends" in root.value
         if not missing and (node is None or not isinstance(node.value, dict) or not node.value):

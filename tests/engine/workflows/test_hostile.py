@@ -99,6 +99,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: 1\n---\nb: 2", "wf.yaml:2:1: but found another document"),
         (inside("x, to: ../up"), "wf.yaml:3:45: stage 'images': to: must be a folder inside the output folder"),
         ("pano_mvs: 1\nname: CON\nstages: {a: {use: pairs.exhaustive}}", "wf.yaml:2:7: name must consist"),
+        ("pano_mvs: 1\ndescription: [x]\nstages: {a: {use: pairs.exhaustive}}", "wf.yaml:2:14: description must be"),
         ("pano_mvs: 1\nstages: {aux.x: {use: pairs.exhaustive}}", "stage name 'aux.x' must consist"),
         ("pano_mvs: 1\nstages: {a/../b: {use: pairs.exhaustive}}", "stage name 'a/../b' must consist"),
         ("pano_mvs: 1\nstages: {" + "a" * 500 + ": {use: pairs.exhaustive}}", "must consist"),

@@ -261,6 +261,7 @@ def test_groups_with_the_name_of_an_older_stage_lose_it(grouped: Toy) -> None:
         ("{means: 3}", "'means' is a group of stages"),
         ("{means: {group: numbers.yaml, retries: 2}}", "child.yaml:4:39: group 'means': unknown key 'retries'"),
         ("{means: {stages: {mean: {}}, description: 3}}", "group 'means': description must be text"),
+        ("{numbers: {stages: null}}", "`stages:` is empty, which changes nothing; `numbers: null` removes the group"),
         ("{../a: {stages: {b: {use: toy.scale}}}}", "group name '../a' must consist of letters"),
         ("{a: {stages: {b: {retries: 1}}}}", "child.yaml:4:23: stage 'b' needs `use: NAME`"),
         ("{means: {stages: {meen: }}}", "stage 'meen' needs `use: NAME`; there is no stage of that name to remove"),
