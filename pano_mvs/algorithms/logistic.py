@@ -24,6 +24,9 @@ class Term:
     knots: tuple[float, ...]
     losses: tuple[float, ...]  # (K − 1) what is lost from each knot to the one before it; not negative
     missing: float  # what is lost if it was not measured; not negative
+    # another measurement, and the value from which this one counts in full: with less of it, this one counts less in
+    # proportion; None: always in full
+    full_from: tuple[str, float] | None = None
 
     def lost(self, values: FloatArray) -> FloatArray:
         """Return how far each value (N,) stays behind the best one on each step, (N, K), the last for missing ones."""
@@ -45,6 +48,13 @@ def steps_behind(values: FloatArray, knots: tuple[float, ...]) -> FloatArray:
     return behind
 
 
+def counted_share(columns: Mapping[str, FloatArray], full_from: tuple[str, float]) -> FloatArray:
+    """Return how far a measurement counts (N,), 0 to 1, by another one; in full where that was not measured."""
+    name, full = full_from
+    other = columns.get(name, np.array([np.nan]))
+    return np.where(np.isfinite(other), np.clip(other / full, 0.0, 1.0), 1.0)
+
+
 @dataclass(frozen=True)
 class Model:
     """The fitted model."""
@@ -54,9 +64,13 @@ class Model:
 
     def contributions(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return what each measurement of a row adds to the logarithm of the odds; 0 or less."""
-        return {
-            name: float(term.contributions(np.array([row.get(name, np.nan)]))[0]) for name, term in self.terms.items()
-        }
+        columns = {name: np.array([row.get(name, np.nan)]) for name in (*row, *self.terms)}
+        return {name: float(self._contribution(name, columns)[0]) for name in self.terms}
+
+    def _contribution(self, name: str, columns: Mapping[str, FloatArray]) -> FloatArray:
+        term = self.terms[name]
+        found = term.contributions(columns[name])
+        return found if term.full_from is None else found * counted_share(columns, term.full_from)
 
     def probability(self, row: Mapping[str, float]) -> float:
         """Return the probability for one row of measurements."""
@@ -65,8 +79,8 @@ class Model:
     def log_odds(self, columns: Mapping[str, FloatArray]) -> FloatArray:
         """Return the logarithms of the odds (N,) for columns (N,) of measurements, NaN where missing."""
         found = np.full(len(next(iter(columns.values()))), self.intercept)
-        for name, term in self.terms.items():
-            found += term.contributions(columns[name])
+        for name in self.terms:
+            found += self._contribution(name, columns)
         return found
 
     def probabilities(self, columns: Mapping[str, FloatArray]) -> FloatArray:

@@ -78,7 +78,7 @@ def test_without_matches_or_permission_it_only_reports(
     assert set(poses.doubts) == {WRONG}
     assert poses.right_probabilities is not None
     for row, probability in zip(poses.evidence.values(), poses.right_probabilities, strict=True):
-        assert matched or row["agreeing"] is None
+        assert matched or row["contradicted"] is None
         known = {name: np.nan if value is None else value for name, value in row.items()}
         assert FITTED.probability(known) == pytest.approx(probability)
     assert ctx.metrics["p_right_lowest"] == poses.right_probabilities.min()

@@ -277,7 +277,7 @@ def _options(
         maps: confirmed ranges of its cameras.
         known: places that were compared before.
     """
-    surroundings = Surroundings(confirmation, model.cameras, maps)
+    surroundings = Surroundings(confirmation, model.cameras, maps.get)
 
     def places(image: int) -> Iterator[tuple[_Option, Callable[[], Rigid3]]]:
         evidence, found = model.place(image, most=_PLACES)

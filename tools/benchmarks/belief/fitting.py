@@ -12,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.logistic import Model, Term, steps_behind
+from pano_mvs.algorithms.logistic import Model, Term, counted_share, steps_behind
 
 FloatArray = NDArray[np.float64]
 
 SIGNS = {
     "ratio": 1,
     "share": 1,
+    "wide_share": 1,
+    "likeness": 1,
+    "unlike": -1,
+    "contradicted": -1,
+    "pairs_contradicting": -1,
     "agreeing": 1,
     "scale_worst": -1,
     "place_rival": -1,
@@ -28,11 +33,18 @@ SIGNS = {
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 
-OF_IMAGES, OF_PAIRS = {"ratio", "share"}, {*SIGNS} - {"ratio", "share"}
+OF_IMAGES = {"ratio", "share", "wide_share", "likeness", "unlike"}
+OF_PAIRS = {*SIGNS} - OF_IMAGES
+LINKS = {"linked", "links_contradicting"}
+UNKNOWN_OF_TOURS = {"wide_share", "likeness", "unlike", "contradicted", "pairs_contradicting"}
+"""What was not measured yet when `learned.csv` was, the cameras with links."""
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
 ENOUGH = {"ratio": 0.35, "share": 0.25}
 """Values beyond which more of a measurement says nothing more, where places that were left out are predicted better
 with such a limit than without it."""
+FULL_FROM = dict.fromkeys(("wide_share", "likeness", "unlike"), ("pairs_contradicting", 0.1))
+"""From which share of contradicting pairs a measurement counts in full. Where no pair contradicts another one, there is
+no other arrangement for which it could speak."""
 PENALTY = 3.0
 
 
@@ -85,7 +97,7 @@ def read_table(path: Path) -> Cameras:
     """Return the cameras of a file that `write_table` has written."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SIGNS}
+    columns = {name: np.array([float(row.get(name) or "nan") for row in rows]) for name in SIGNS}
     flags = {name: np.array([row[name] == "1" for row in rows], np.bool_) for name in ("right", "doubted")}
     captures = [f"{row['family']} {row['seed']} {row['variant']}" for row in rows]
     return Cameras(
@@ -111,11 +123,34 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
     measurement only ever counts the way of its sign, and a missing one is never better than the best. Each camera
     counts four times: with all that was measured, with the measurements of images alone, with those of pairs alone, and
     without any, since users may lack either or both.
+
+    Links are fitted to all cameras, beside what is known of those that have any; the rest to the others.
     """
+    of_links = {name: sign for name, sign in signs.items() if name not in UNKNOWN_OF_TOURS}
+    if not LINKS & signs.keys():
+        return _fitted(cameras, penalty=penalty, signs=signs)
+    links = _fitted(cameras, penalty=penalty, signs=of_links)
+    if of_links == dict(signs):
+        return links
+    linked = {name: links.terms[name] for name in signs if name in LINKS and name in links.terms}
+    rest = {name: sign for name, sign in signs.items() if name not in LINKS}
+    without = ~np.any([np.isfinite(cameras.columns[name]) for name in sorted(LINKS)], axis=0)
+    model = _fitted(cameras[without], penalty=penalty, signs=rest)
+    intercept = model.intercept + sum(term.missing for term in linked.values())
+    return Model(round(intercept, 4), {**model.terms, **linked})
+
+
+def _fitted(cameras: Cameras, *, penalty: float, signs: Mapping[str, int]) -> Model:
     cameras = joined([cameras, *(_only(cameras, names) for names in (OF_IMAGES, OF_PAIRS, set[str]()))])
     knots = {name: quantile_knots(cameras.columns[name], sign, enough=ENOUGH.get(name)) for name, sign in signs.items()}
-    weights = np.ones(len(cameras.right))
-    return most_likely(cameras.columns, cameras.right.astype(np.float64), weights, knots=knots, penalty=penalty)
+    return most_likely(
+        cameras.columns,
+        cameras.right.astype(np.float64),
+        np.ones(len(cameras.right)),
+        knots=knots,
+        penalty=penalty,
+        full_from=FULL_FROM,
+    )
 
 
 def most_likely(
@@ -125,6 +160,7 @@ def most_likely(
     *,
     knots: Mapping[str, tuple[float, ...]],
     penalty: float,
+    full_from: Mapping[str, tuple[str, float]] | None = None,
 ) -> Model:
     """Return the model with the largest likelihood less a penalty on the squared losses, all of which are at least 0.
 
@@ -134,8 +170,15 @@ def most_likely(
         weights: (N,) of each row.
         knots: of each measurement that is used.
         penalty: on the squared losses.
+        full_from: see `Term.full_from`, of measurements for which another one says how far they count.
     """
-    behind = np.hstack([steps_behind(columns[name], own) for name, own in knots.items()])
+    full_from = full_from or {}
+
+    def behind_of(name: str) -> FloatArray:
+        own = steps_behind(columns[name], knots[name])
+        return own * counted_share(columns, full_from[name])[:, None] if name in full_from else own
+
+    behind = np.hstack([behind_of(name) for name in knots])
 
     def cost(values: FloatArray) -> tuple[float, FloatArray]:
         logit = values[0] - behind @ values[1:]
@@ -156,7 +199,7 @@ def most_likely(
     terms, at = {}, 1
     for name, own in knots.items():
         losses = np.round(found.x[at : at + len(own)], 4)
-        terms[name] = Term(own, tuple(losses[:-1].tolist()), float(losses[-1]))
+        terms[name] = Term(own, tuple(losses[:-1].tolist()), float(losses[-1]), full_from.get(name))
         at += len(own)
     return Model(
         round(float(found.x[0]), 4), {name: term for name, term in terms.items() if any(term.losses) or term.missing}

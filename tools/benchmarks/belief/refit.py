@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.logistic import Model
+from pano_mvs.algorithms.logistic import Model, Term
 from pano_mvs.algorithms.poses.verification.belief.doubts import is_doubtful
 from tools.benchmarks.belief.fitting import (
     PENALTY,
@@ -134,13 +134,18 @@ def draw(path: Path, probability: FloatArray, cameras: Cameras) -> None:
 def source_of(model: Model) -> str:
     """Return the model as a Python module: a change of its coefficients is a change of the code of `poses.verify`."""
     terms = "".join(
-        f'        "{name}": Term({term.knots}, {term.losses}, {term.missing}),\n' for name, term in model.terms.items()
+        f'        "{name}": Term({", ".join(map(repr, _arguments(term)))}),\n' for name, term in model.terms.items()
     )
     return (
         '"""The coefficients that `python -m tools benchmarks belief.refit` has fitted."""\n\n'
         "from pano_mvs.algorithms.logistic import Model, Term\n\n"
         f"FITTED = Model(\n    {model.intercept},\n    {{\n{terms}    }},\n)\n"
     )
+
+
+def _arguments(term: Term) -> tuple[object, ...]:
+    found = term.knots, term.losses, term.missing
+    return found if term.full_from is None else (*found, term.full_from)
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +16,7 @@ from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_gri
 
 _WINDOW = 7  # side of the windows, in small pixels, in which pictures are compared
 _NOISE_VARIANCE = 12.0  # of a colour in Lab, all channels together
+_MAX_CAMERAS = 256  # whose points are kept, of a MB each
 _LEAST_KNOWN = 0.3  # share of a window for which colours are expected
 
 
@@ -24,6 +26,7 @@ class Appearance(NamedTuple):
     agreement: float = 0.0  # mean correlation in small windows, from -1 to 1; 0 if nothing is expected
     correlation: float = 0.0  # of all colours, likewise
     cover: float = 0.0  # share of its textured pixels, by solid angle, for which something is expected
+    unlike: float = 0.0  # share of these, by solid angle, whose window has a correlation below 0
 
 
 class Surroundings:
@@ -35,19 +38,18 @@ class Surroundings:
     Args:
         confirmation: of the capture, whose small pictures are compared.
         cameras: cam_from_world by position of the image.
-        ranges: (H, W) ranges that other images confirm (`Confirmation.ranges`), NaN elsewhere, of each camera.
+        ranges: returns the (H, W) ranges of a camera that other images confirm (`Confirmation.ranges`), NaN elsewhere;
+            None if nothing is known of it.
     """
 
     def __init__(
-        self, confirmation: Confirmation, cameras: Mapping[int, Rigid3], ranges: Mapping[int, NDArray[np.float32]]
+        self,
+        confirmation: Confirmation,
+        cameras: Mapping[int, Rigid3],
+        ranges: Callable[[int], NDArray[np.float32] | None],
     ) -> None:
-        self._confirmation, self._cameras = confirmation, cameras
-        self._points: dict[int, tuple[FloatArray, NDArray[np.float32]]] = {}
-        for image, own in ranges.items():
-            known = np.isfinite(own)
-            camera = cameras[image]
-            points = camera.center + own[known, None] * (ray_grid(own.shape)[known] @ camera.rotation)
-            self._points[image] = points, self._colors(image)[known]
+        self._confirmation, self._cameras, self._ranges = confirmation, cameras, ranges
+        self._points = lru_cache(_MAX_CAMERAS)(self._points_of)
 
     def appearance(self, image: int, pose: Rigid3) -> Appearance:
         """Return how far an image shows at a pose (cam_from_world) what the nearest cameras know.
@@ -56,7 +58,7 @@ class Surroundings:
         normalised correlation, and as a whole.
         """
         small = self._confirmation.small(image)
-        sources = [self._points[idx] for idx in nearest_cameras(pose, self._cameras) if idx in self._points]
+        sources = [self._points(idx) for idx in nearest_cameras(pose, self._cameras)]
         points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in sources)])
         colors = np.concatenate([np.zeros((0, 3), np.float32), *(colors for _, colors in sources)])
         if not len(points):
@@ -73,7 +75,18 @@ class Surroundings:
             float((area * agreement)[inside].sum() / max(area[inside].sum(), least)),
             _correlation(expected[known], shown[known], area[known]),
             float(area[inside].sum() / max(area[textured].sum(), least)),
+            float(area[inside & (agreement < 0)].sum() / max(area[inside].sum(), least)),
         )
+
+    def _points_of(self, image: int) -> tuple[FloatArray, NDArray[np.float32]]:
+        """Return the points that a camera knows, (P, 3), with their colours."""
+        ranges = self._ranges(image)
+        if ranges is None:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+        known = np.isfinite(ranges)
+        camera = self._cameras[image]
+        points = camera.center + ranges[known, None] * (ray_grid(ranges.shape)[known] @ camera.rotation)
+        return points, self._colors(image)[known]
 
     def _colors(self, image: int) -> NDArray[np.float32]:
         """Return the colours of a small picture in Lab, (H, W, 3), slightly blurred."""

@@ -32,6 +32,8 @@ SHARED_FROM = 8
 MIN_TEXTURED = 0.05
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
 _CLASSES = len(_PARALLAX_EDGES_DEG)
+_WIDE = slice(5, _CLASSES - 1)  # the classes of more than 30°
+_MIN_WIDE_SR = 0.1
 # Weight, as solid angle, of the overall share in each class.
 _PRIOR = 0.05
 
@@ -64,6 +66,15 @@ class Evidence:
         """The confirmed share of what is textured and seen under a parallax; NaN if that is too little."""
         seen = self.textured[:-1].sum()
         return float(self.confirmed[:-1].sum() / seen) if seen >= MIN_TEXTURED * 4 * np.pi else float("nan")
+
+    @property
+    def wide_share(self) -> float:
+        """The confirmed share of what is textured and seen under more than 30°; NaN if that is too little.
+
+        Cameras of bays that look alike, put into one bay, are confirmed under small parallaxes only.
+        """
+        seen = self.textured[_WIDE].sum()
+        return float(self.confirmed[_WIDE].sum() / seen) if seen > _MIN_WIDE_SR else float("nan")
 
     def expected_share(self, others: Sequence[Evidence]) -> float:
         """Return the share that the evidence of other cameras suggests, class by class; NaN without other cameras.

@@ -10,10 +10,11 @@ import numpy as np
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.resection import points_needed
 from pano_mvs.algorithms.poses.verification.aliases import other_arrangement
+from pano_mvs.algorithms.poses.verification.appearance import Surroundings
 from pano_mvs.algorithms.poses.verification.arrangements import is_more_confirmed
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST, is_doubtful, is_left_out, reason
-from pano_mvs.algorithms.poses.verification.belief.evidence import Row, camera_evidence, is_same_place
+from pano_mvs.algorithms.poses.verification.belief.evidence import OfImages, Row, camera_evidence, is_same_place
 from pano_mvs.algorithms.poses.verification.confirmation import SHARED_FROM, SOURCES, Confirmation, nearest_cameras
 from pano_mvs.geometry import Rigid3
 
@@ -24,10 +25,7 @@ _MAX_PLACES = 4  # number of places of an image that are compared, as many as a 
 class CameraChecks:
     """Evidence of the images for or against the cameras of a model."""
 
-    # image position to the confirmed share of its textured pixels; NaN if too little can be judged
-    shares: dict[int, float] = field(default_factory=dict)
-    # image position to the share that its neighbours suggest; NaN likewise
-    expected: dict[int, float] = field(default_factory=dict)
+    of_images: dict[int, OfImages] = field(default_factory=dict)  # image position to what the images say of its camera
     evidence: dict[int, Row] = field(default_factory=dict)  # image position to all measurements of its camera
     moved: set[int] = field(default_factory=set)  # images that were moved to another pose
     p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
@@ -127,7 +125,6 @@ def _at_best_place(
 def check_cameras(model: PlacedModel) -> CameraChecks:
     """Return the evidence of the pairs alone for the cameras of a model, without changing it."""
     found = CameraChecks(asked=False)
-    found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
     _believe(model, found)
     return found
 
@@ -135,7 +132,8 @@ def check_cameras(model: PlacedModel) -> CameraChecks:
 def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) -> None:
     """Compare the confirmed share of each image with the share that its nearest neighbours suggest.
 
-    In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
+    Each image is also compared with what the others expect of it. In larger captures the images share their small
+    sweeps. Images whose result is then less than perfect are judged
     again by sweeps of their neighbours without them.
     """
     # The first pass uses shared sweeps; a second one follows below this expected share.
@@ -156,16 +154,20 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
         doubted = [image for image in evidence if evidence[image].share < 0.9 * expected_of(image)]
         for image in doubted:
             evidence[image] = confirmation.evidence(image, model.cameras[image], model.cameras)
-    found.shares = {image: own.share for image, own in evidence.items()}
-    found.expected = {image: expected_of(image) for image in evidence}
+    surroundings = Surroundings(confirmation, model.cameras, lambda image: confirmation.ranges(image, model.cameras))
+    found.of_images = {
+        image: OfImages(
+            own.share, expected_of(image), own.wide_share, surroundings.appearance(image, model.cameras[image])
+        )
+        for image, own in evidence.items()
+    }
 
 
 def _believe(model: PlacedModel, found: CameraChecks, *, miss_cost: float = MISS_COST) -> None:
     """Find the probability that each camera is right, and the doubts that follow from it."""
     rows = found.evidence = camera_evidence(
         model,
-        found.shares,
-        found.expected,
+        found.of_images,
         contradicting_before=found.links_contradicting,
         refuted=found.refuted,
         undecided=found.undecided,

@@ -130,8 +130,8 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
 
     return replace(
         poses,
-        confirmed_shares=of_each(checks.shares) if checks.asked else None,
-        expected_shares=of_each(checks.expected) if checks.asked else None,
+        confirmed_shares=of_each({idx: own.share for idx, own in checks.of_images.items()}) if checks.asked else None,
+        expected_shares=of_each({idx: own.expected for idx, own in checks.of_images.items()}) if checks.asked else None,
         evidence={
             pairs.names[idx]: {key: float(value) if np.isfinite(value) else None for key, value in row.items()}
             for idx, row in checks.evidence.items()

@@ -19,7 +19,7 @@ BLOCK = {idx: pose for idx, pose in enumerate(POSES) if idx != IMAGE}
 @pytest.fixture(scope="module")
 def surroundings() -> Surroundings:
     confirmation = Confirmation(lambda image: (PICTURES[image], WHOLE), width_px=128)
-    return Surroundings(confirmation, BLOCK, {idx: confirmation.ranges(idx, BLOCK) for idx in BLOCK})
+    return Surroundings(confirmation, BLOCK, lambda idx: confirmation.ranges(idx, BLOCK))
 
 
 def moved(offset: tuple[float, float, float], turn_deg: float = 0.0) -> Rigid3:
@@ -40,25 +40,24 @@ def test_elsewhere_it_shows_something_else(
 ) -> None:
     there, elsewhere = (surroundings.appearance(IMAGE, pose) for pose in (POSES[IMAGE], moved(offset, turn_deg)))
     assert elsewhere.agreement < 0.6 * there.agreement
+    assert elsewhere.unlike > 0.1 + there.unlike
     assert place_score(0.0, elsewhere) < place_score(0.0, there)
 
 
 def test_without_ranges_nothing_is_expected() -> None:
     confirmation = Confirmation(lambda image: (PICTURES[image], WHOLE), width_px=128)
     unknown = np.full((64, 128), np.nan, np.float32)
-    assert Surroundings(confirmation, BLOCK, dict.fromkeys(BLOCK, unknown)).appearance(IMAGE, POSES[IMAGE]) == (
-        Appearance(0.0, 0.0, 0.0)
-    )
-    assert Surroundings(confirmation, BLOCK, {}).appearance(IMAGE, POSES[IMAGE]) == Appearance()
+    assert Surroundings(confirmation, BLOCK, lambda _: unknown).appearance(IMAGE, POSES[IMAGE]) == Appearance()
+    assert Surroundings(confirmation, BLOCK, lambda _: None).appearance(IMAGE, POSES[IMAGE]) == Appearance()
 
 
 def test_nearer_points_hide_farther_ones() -> None:
     """Every point of a far wall is known as well, so that a picture of the far wall would agree without this."""
     confirmation = Confirmation(lambda image: (PICTURES[image], WHOLE), width_px=128)
     ranges = {idx: confirmation.ranges(idx, BLOCK) for idx in BLOCK}
-    before = Surroundings(confirmation, BLOCK, ranges).appearance(IMAGE, POSES[IMAGE])
+    before = Surroundings(confirmation, BLOCK, ranges.get).appearance(IMAGE, POSES[IMAGE])
     near = {idx: np.where(np.isfinite(own), np.float32(0.05), own) for idx, own in ranges.items()}
-    both = Surroundings(confirmation, BLOCK, near).appearance(IMAGE, POSES[IMAGE])
+    both = Surroundings(confirmation, BLOCK, near.get).appearance(IMAGE, POSES[IMAGE])
     assert both.agreement < before.agreement
 
 

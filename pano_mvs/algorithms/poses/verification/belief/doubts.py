@@ -33,6 +33,34 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
         "too little of what it sees has texture that other images could confirm",
         _CLOSER,
     ),
+    "wide_share": (
+        lambda row: f"other images confirm only {_percent(row['wide_share'])} of what it sees under more than 30°",
+        "",
+        _CLOSER,
+    ),
+    "likeness": (
+        lambda row: (
+            f"what it shows is correlated by {-row['likeness']:.2f} less with what other images lead to expect there "
+            "than in the mean of the other cameras"
+        ),
+        "",
+        _CLOSER,
+    ),
+    "unlike": (
+        lambda row: f"{_percent(row['unlike'])} of what it shows is unlike what other images lead to expect there",
+        "",
+        _CLOSER,
+    ),
+    "contradicted": (
+        lambda row: f"{_percent(row['contradicted'])} of the weight of its pairs contradicts its place",
+        "",
+        _BETWEEN,
+    ),
+    "pairs_contradicting": (
+        lambda row: f"{_percent(row['pairs_contradicting'])} of the weight of all pairs contradicts the cameras",
+        "",
+        _BETWEEN,
+    ),
     "agreeing": (
         lambda row: (
             f"only {row['agreeing']:.0f} {plural(round(row['agreeing']), 'pair agrees', 'pairs agree')} with its place"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -10,16 +11,25 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.verification.appearance import Appearance
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, float]
 
 
+class OfImages(NamedTuple):
+    """What the images say of a camera; NaN where unknown."""
+
+    share: float = np.nan  # of its texture, that other images confirm
+    expected: float = np.nan  # the share that its neighbours suggest
+    wide_share: float = np.nan  # of what it sees under more than 30°, that other images confirm
+    appearance: Appearance = Appearance()  # what it shows, compared with what its neighbours expect there, if anything
+
+
 def camera_evidence(
     model: PlacedModel,
-    shares: Mapping[int, float],
-    expected: Mapping[int, float],
+    of_images: Mapping[int, OfImages],
     *,
     images: Collection[int] | None = None,
     contradicting_before: float = np.nan,
@@ -30,8 +40,7 @@ def camera_evidence(
 
     Args:
         model: the cameras, with their pairs if these are known.
-        shares: image position to the share of its texture that other images confirm; NaN where unknown.
-        expected: image position to the share that its neighbours suggest.
+        of_images: image position to what the images say of its camera.
         images: whose evidence to return; None for that of all cameras.
         contradicting_before: the largest `links_contradicting` of the model with cameras that were left out since then:
             what contradicted them speaks against those that agree with them, such as copies of a room, as well.
@@ -40,29 +49,37 @@ def camera_evidence(
 
     Returns:
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
-        `agreeing` (number of pairs that agree), `scale_worst` (largest |log ratio| of a distance between cameras to the
-        one that known points suggest), `place_rival` (weight of
-        another place relative to its own), `repeats` (mean weight of other geometries of the pairs of all cameras,
-        relative to those in use), `linked` (weight of the learned pairs that agree less that of those that do not,
-        across the weakest cut between the camera and the larger part of those with such pairs; see `weight_of_pair`),
-        and `links_contradicting` (share of the weight of all learned pairs of the model that does not agree with its
-        cameras), for cameras with such.
+        `wide_share`, `likeness` (correlation of what it shows with what is expected there, less the mean of the other
+        cameras), `unlike` (see `Appearance`), `contradicted` (share of the weight of its pairs that does not agree with
+        its place), `pairs_contradicting` (the mean of it over all cameras), `agreeing` (number of pairs that agree),
+        `scale_worst` (largest |log ratio| of a distance between cameras to the one that known points suggest),
+        `place_rival` (weight of another place relative to its own), `repeats` (mean weight of other geometries of the
+        pairs of all cameras, relative to those in use), `linked` (weight of the learned pairs that agree less that of
+        those that do not, across the weakest cut between the camera and the larger part of those with such pairs; see
+        `weight_of_pair`), and `links_contradicting` (share of the weight of all learned pairs of the model that does
+        not agree with its cameras), for cameras with such.
     """
     refuted = refuted or {}
     # Other geometries of pairs lead to other places; they do not count once the images refute all of these.
     repeats = _repeats(model) if undecided is None or undecided else 0.0
+    # If no pair of a camera agrees, and those that do not may be chance, the pairs say nothing.
+    silent = model.cameras.keys() - {image for edge in model.chosen for image in edge} - _certain(model)
+    contradicted = {image: share for image, share in _contradicted(model).items() if image not in silent}
+    pairs_contradicting = float(np.mean([*contradicted.values()])) if contradicted else np.nan
     linked, links_contradicting = _links(model)
     links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
     for image in sorted(model.cameras if images is None else images):
-        share = shares.get(image, np.nan)
-        of_pairs = _of_pairs(model, image, refuted.get(image, ()))
-        # If no pair agrees, and those that do not may be chance, the pairs say nothing.
-        known = of_pairs["agreeing"] > 0 or _has_certain_pair(model, image)
+        own = of_images.get(image, OfImages())
+        of_pairs = _of_pairs(model, image, refuted.get(image, ())) | {"contradicted": contradicted.get(image, np.nan)}
         rows[image] = {
-            "ratio": share / expected[image] if expected.get(image, np.nan) > 0 else np.nan,
-            "share": share,
-            **(of_pairs if known else dict.fromkeys(of_pairs, np.nan)),
+            "ratio": own.share / own.expected if own.expected > 0 else np.nan,
+            "share": own.share,
+            "wide_share": own.wide_share,
+            "likeness": _likeness(image, of_images),
+            "unlike": own.appearance.unlike if own.appearance.cover > 0 else np.nan,
+            **(dict.fromkeys(of_pairs, np.nan) if image in silent else of_pairs),
+            "pairs_contradicting": pairs_contradicting,
             "repeats": repeats,
             "linked": linked.get(image, np.nan),
             "links_contradicting": links_contradicting if image in linked else np.nan,
@@ -70,11 +87,39 @@ def camera_evidence(
     return rows
 
 
-def _has_certain_pair(model: PlacedModel, image: int) -> bool:
-    return any(
-        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < -50
+def _certain(model: PlacedModel) -> set[int]:
+    """Return the cameras with a pair that is no chance, whether or not it agrees with them."""
+    return {
+        image
         for edge, view in (model.pairs.compared or {}).items()
-    )
+        if model.cameras.keys() >= {*edge} and view.log10_false_alarms < -50
+        for image in edge
+    }
+
+
+def _likeness(image: int, of_images: Mapping[int, OfImages]) -> float:
+    """Return how much better what an image shows is correlated with what is expected than in other images; or NaN.
+
+    Light and noise lower the correlation of all of them.
+    """
+    correlations = {idx: own.appearance.correlation for idx, own in of_images.items() if own.appearance.cover > 0}
+    others = [correlation for idx, correlation in correlations.items() if idx != image]
+    return float(correlations[image] - np.mean(others)) if image in correlations and others else np.nan
+
+
+def _contradicted(model: PlacedModel) -> dict[int, float]:
+    """Return which share of the weight of its pairs does not agree with each camera, if it has any."""
+    weights = {
+        edge: found[0].weight
+        for edge, found in model.pairs.geometries.items()
+        if model.cameras.keys() >= {*edge} and found[0].weight > 0
+    }
+    of_cameras: dict[int, FloatArray] = {}
+    for edge, weight in weights.items():
+        for image in edge:
+            both = of_cameras.setdefault(image, np.zeros(2))
+            both += weight * np.array([edge not in model.chosen, 1.0])
+    return {image: float(against / all_of_it) for image, (against, all_of_it) in of_cameras.items()}
 
 
 def _repeats(model: PlacedModel) -> float:
