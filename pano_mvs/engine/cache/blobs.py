@@ -210,6 +210,11 @@ class BlobStore:
         name = place.name if isinstance(place, Packed) else path
         return DamagedBlobError(f"{name} {why}; the same command computes it again")
 
+    def forget(self, ref: BlobRef) -> Path | Packed:
+        """Return where a blob is that is about to be deleted, and check its bytes again if it is stored again."""
+        self._verified.discard(ref)
+        return self.place(ref)
+
     def verified_place(self, ref: BlobRef) -> Path | Packed:
         """Return where a blob is, after checking its bytes; this object checks each blob once."""
         place = self.place(ref)

@@ -249,7 +249,7 @@ def collect(
             found.records.append(value.place)
             found.size_bytes += value.size_bytes
         else:
-            kept_blobs.update(_packed(ref.digest) for ref in record.blobs())
+            kept_blobs.update(_packed(ref.digest) for ref in record.lasting_blobs())
     unfinished = (
         _Value(path, "", stat.st_size, stat.st_mtime)
         for path in store.blobs.packs.without_index()
@@ -297,6 +297,12 @@ def _packed(digest: str) -> bytes:
     Even among millions of digests no two begin alike. If two did, one file too many would be kept.
     """
     return bytes.fromhex(digest[:DIGEST_BYTES]) if IS_DIGEST.fullmatch(digest) else b""
+
+
+def each_record(store: Store) -> Iterator[tuple[str, bytes]]:
+    """Yield the key and the bytes of every record, whether or not it is intact."""
+    for value in _records(store):
+        yield value.digest, _read(value.place) or b""
 
 
 def _records(store: Store) -> Iterator[_Value]:
