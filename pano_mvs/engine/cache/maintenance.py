@@ -1,7 +1,8 @@
 """Maintenance of a cache: its contents by stage, verification, packing, and garbage collection.
 
-Packing moves records, arrays and JSON values from files of their own into packs, so that large captures take few files.
-Values are found in the packs before their files are removed, so that runs may use the cache meanwhile.
+Packing moves records, arrays and JSON values from files of their own into packs, so that large captures take few files,
+and compresses arrays there, and files where that pays. Values are found in the packs before their files are removed, so
+that runs may use the cache meanwhile.
 
 Garbage collection keeps what the remembered runs and pins name, and deletes everything else that is older than a given
 age. It takes no lock: what a run has just computed is too recent to be deleted, and a run computes again what is
@@ -24,14 +25,17 @@ from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import make_room, read_regular, whose_temporary
 from pano_mvs.core.paths import is_file, is_link
-from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, element_bytes
+from pano_mvs.engine.cache.compression import stride_of
 from pano_mvs.engine.cache.latest_runs import RunEntry, delete
-from pano_mvs.engine.cache.packs import ARRAY, JSON, RECORD, Packed
+from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, RECORD, Packed
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
 _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
-_MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can read them
+_MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can read them, …
+_MIN_FILE_BYTES = 1 << 16  # of a file to be compressed
+_MIN_PACKED_BYTES = 8_000_000  # … unless they are larger than this
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class StageUsage:
 
     stage: str  # name of the stage in the registry
     units: int
-    size_bytes: int  # size of their blobs; a blob that several units share counts once
+    size_bytes: int  # size of their blobs in the cache; a blob that several units share counts once
     seconds: float
 
 
@@ -98,7 +102,7 @@ def usage_of(store: Store) -> list[StageUsage]:
         for ref in record.own_blobs():
             if ref.digest not in seen:
                 seen.add(ref.digest)
-                total[1] += ref.size_bytes
+                total[1] += store.blobs.stored_bytes(ref)
     found = [StageUsage(name, int(units), int(size), seconds) for name, (units, size, seconds) in totals.items()]
     return sorted(found, key=lambda usage: (-usage.size_bytes, usage.stage))
 
@@ -173,23 +177,29 @@ def _verify_record(store: Store, value: _Value, data: bytes, *, found: Verificat
 
 
 def pack(store: Store) -> int:
-    """Move records, arrays and JSON values from files of their own into packs; return how many files were removed.
+    """Move values from files of their own into packs, and compress them; return how many files were removed.
 
-    Nothing is done below a few hundred files. Runs may use the cache at the same time.
+    Few and small files stay as they are, and so do files that cannot be compressed. Runs may use the cache at the same
+    time.
 
     Raises:
         StoreError: if a file cannot be read, written or removed.
     """
-    loose = [
-        (Packed(store.blobs.packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s), value.place)
-        for value, kind in _packable(store)
-        if isinstance(value.place, Path)
-    ]
-    if len(loose) < _MIN_PACKED_FILES:
-        return 0
     packs = store.blobs.packs
+    found = [(value, kind, value.place) for value, kind in _packable(store) if isinstance(value.place, Path)]
+    if len(found) < _MIN_PACKED_FILES and sum(value.size_bytes for value, _, _ in found) < _MIN_PACKED_BYTES:
+        return 0
+    loose = [
+        (Packed(packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s, element_bytes=size), path)
+        for value, kind, path in found
+        if (size := _element_bytes(value, kind, path))
+    ]
+    if not loose:
+        return 0
+    store.mark_layout()
     small = _merged(packs.times(), sum(value.size_bytes for value, _ in loose))
-    packs.add(chain(loose, ((value, None) for value in packs.each() if value.pack in small)))
+    new = (item for item in loose if item[0].kind != FILE or packs.find(item[0].digest) is None)  # it was unpacked
+    packs.add(chain(list(new), ((value, None) for value in packs.each() if value.pack in small)))
     for value, path in loose:
         if packs.find(value.digest) is not None:
             delete(path)
@@ -219,6 +229,17 @@ def _packable(store: Store) -> Iterator[tuple[_Value, str]]:
     for value in _blobs(store):
         if isinstance(value.place, Path) and value.place.suffix in (ARRAY, JSON):
             yield value, value.place.suffix
+        elif isinstance(value.place, Path) and value.size_bytes >= _MIN_FILE_BYTES:
+            yield value, FILE
+
+
+def _element_bytes(value: _Value, kind: str, path: Path) -> int:
+    """Return the size of the elements of a value, for compressing it; 0 for a file that stays as it is."""
+    if kind in (RECORD, JSON):
+        return 1
+    with suppress(OSError), path.open("rb") as stream:  # another process may have deleted it
+        return element_bytes(stream) if kind == ARRAY else stride_of(stream, value.size_bytes)
+    return 0
 
 
 def collect(

@@ -48,7 +48,8 @@ from pano_mvs.scene import Record
 
 _FULL_BELOW_BYTES = 1_000_000
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
+_READ_LAYOUTS = (2, LAYOUT_VERSION)  # in 2, nothing in packs is compressed
 MIN_FREE_BYTES = 200_000_000
 _RUN_MARK = "run-"
 _FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
@@ -450,7 +451,7 @@ class Store:
                 "the cache, delete the file, and nothing is lost; otherwise choose another cache with --cache DIR"
             ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
-        if type(version) is not int or version != LAYOUT_VERSION:
+        if type(version) is not int or version not in _READ_LAYOUTS:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, but this version uses {LAYOUT_VERSION}. "
                 "Choose another cache with --cache DIR"
@@ -459,6 +460,17 @@ class Store:
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
+
+    def mark_layout(self) -> None:
+        """State the layout of this version before anything is stored that an earlier one cannot read.
+
+        Raises:
+            StoreError: if the cache cannot be written.
+        """
+        path = self.root / "layout.json"
+        text = json.dumps({"layout": LAYOUT_VERSION})
+        if read_regular(path) != text.encode():
+            write_text(path, text)
 
     def _create(self, path: Path) -> None:
         try:

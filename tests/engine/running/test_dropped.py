@@ -430,7 +430,7 @@ def test_another_result_than_before_computes_what_reads_it(rows: Rows) -> None:
     rows.run()
     store = rows.store
     for idx, record in enumerate(rows.records("first")):
-        other = store.put_value(Numbers(np.arange(100.0) + idx))
+        other = store.put_value(Numbers(np.arange(100.0) + 1000 + idx))
         store.replace([replace(record, output=other)])
         for ref in other.blobs():
             store.blobs.path(ref).unlink()
@@ -460,7 +460,7 @@ def test_every_executor_drops_and_computes_again(rows: Rows, name: str) -> None:
 
 def test_results_are_dropped_during_a_run_if_they_take_much_space(rows: Rows, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dropped, "MUCH_BYTES", 2000)
-    had: dict[str, bool] = {}
+    had: dict[str, int] = {}
 
     class Watching(Answering):
         def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
