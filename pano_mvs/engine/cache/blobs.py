@@ -24,6 +24,7 @@ from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, dig
 from pano_mvs.core.errors import ChangedFileError, StoreError
 from pano_mvs.core.files import make_room, replacing
 from pano_mvs.core.paths import is_folder, is_link
+from pano_mvs.engine.cache.compression import MOST_STRIDE
 from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, Packed, Packs
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
@@ -33,6 +34,7 @@ FOLDER_DIGITS = 3
 """Number of digits of a key or digest in the name of the folder of its file."""
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
+_MOST_COMPONENTS = 4  # of points, normals, colours
 _MAGIC = np.lib.format.magic(1, 0)
 
 
@@ -379,16 +381,18 @@ def _other_format(data: bytes) -> NDArray[Any]:
 
 
 def element_bytes(stream: IO[bytes]) -> int:
-    """Return the size of the elements of the array in a .npy file; 1 if it is not known."""
+    """Return the size of the numbers, or of the points and vectors, in a .npy file; 1 if it is not known."""
     start = stream.read(len(_MAGIC) + 2)
     if not start.startswith(_MAGIC):
         return 1
     try:
         length = start[len(_MAGIC) :]
-        _, dtype, _ = _header(length + stream.read(int.from_bytes(length, "little")))
+        shape, dtype, fortran_order = _header(length + stream.read(int.from_bytes(length, "little")))
     except ValueError:
         return 1
-    return dtype.itemsize if 64 % dtype.itemsize == 0 else 1  # the header takes a multiple of 64 bytes
+    is_vector = len(shape) >= 2 and shape[-1] <= _MOST_COMPONENTS and not fortran_order
+    size_bytes = dtype.itemsize * (max(1, shape[-1]) if is_vector else 1)
+    return size_bytes if size_bytes <= MOST_STRIDE else 1
 
 
 @lru_cache(maxsize=4096)

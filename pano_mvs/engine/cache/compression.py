@@ -1,9 +1,11 @@
 """Compression of stored values: their bytes are shuffled, as by Blosc, and compressed with Zstandard.
 
 Of numbers of several bytes, the first bytes of all come first, then the second bytes, and so on, since bytes of equal
-significance resemble each other. A value is divided into chunks, so that only a part of it is in memory at a time:
+significance resemble each other; of points, likewise, first those of all x. Where that is smaller, each byte is
+replaced by its difference from the one before it, as by the predictor of TIFF for floating-point numbers. A value is
+divided into chunks, so that only a part of it is in memory at a time:
 
-    magic, size of an element (1 byte), size of the value (8 bytes), size of each chunk (4 bytes each), chunks
+    magic, shuffle (1 byte), size of the value (8 bytes), size of each compressed chunk (4 bytes each), chunks
 
 Numbers are little endian. What a value is stored under stays the digest of its own bytes.
 """
@@ -11,7 +13,7 @@ Numbers are little endian. What a value is stored under stays the digest of its 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 import zstandard
@@ -21,30 +23,61 @@ _MAGIC = b"pmvz\x01"
 _CHUNK_BYTES = 1 << 20
 _LEVEL = 1  # level 3 saves 3 % more, and takes twice as long
 _SAMPLE_BYTES = 1 << 16
-_MOST_STRIDE = 64
+_DIFFERENCES = 1 << 7
+MOST_STRIDE = 64
 _PAYS_BELOW = 0.9  # share of the size
 
 
-def stride_of(source: IO[bytes], size_bytes: int) -> int:
-    """Return the size of the elements of which a file seems to consist, found by compressing a sample from its middle.
+class Shuffle(NamedTuple):
+    """How the bytes of a value are ordered before they are compressed."""
 
-    Returns:
-        1 to 64; 0 if compression does not pay, as for most images.
+    stride: int = 1  # size in bytes of the elements, 1 to 64
+    differences: bool = False  # whether each byte is replaced by its difference from the one before it
+
+    def to_byte(self) -> bytes:
+        """Return it as one byte."""
+        return bytes([self.stride | (_DIFFERENCES if self.differences else 0)])
+
+    @staticmethod
+    def from_byte(byte: int) -> Shuffle:
+        """Return the shuffle in a byte; raise ValueError if there is none."""
+        shuffle = Shuffle(byte & ~_DIFFERENCES, bool(byte & _DIFFERENCES))
+        if not 1 <= shuffle.stride <= MOST_STRIDE:
+            raise ValueError("a compressed value with a damaged beginning")
+        return shuffle
+
+
+def shuffle_of_array(source: IO[bytes], size_bytes: int, *, stride: int) -> Shuffle:
+    """Return the shuffle that compresses a sample from the middle of an array best, given the size of its elements."""
+    sample = _sample(source, size_bytes)
+    return min((Shuffle(stride, False), Shuffle(stride, True)), key=lambda shuffle: _sample_bytes(sample, shuffle))
+
+
+def shuffle_of_file(source: IO[bytes], size_bytes: int) -> Shuffle | None:
+    """Return the shuffle that compresses a sample of a file of unknown content best; None if none pays.
+
+    Most images are compressed already; the points of a PLY file are not.
     """
+    sample = _sample(source, size_bytes)
+    if _sample_bytes(sample, Shuffle()) > 0.97 * len(sample):
+        return None
+    sizes = {Shuffle(stride): _sample_bytes(sample, Shuffle(stride)) for stride in range(1, MOST_STRIDE + 1)}
+    stride = min(sizes, key=lambda shuffle: (sizes[shuffle], shuffle)).stride
+    sizes[Shuffle(stride, True)] = _sample_bytes(sample, Shuffle(stride, True))
+    best = min(sizes, key=lambda shuffle: (sizes[shuffle], shuffle))
+    return best if sizes[best] <= _PAYS_BELOW * len(sample) else None
+
+
+def _sample(source: IO[bytes], size_bytes: int) -> NDArray[np.uint8]:
     source.seek(max(0, (size_bytes - _SAMPLE_BYTES) // 2))
-    sample = np.frombuffer(source.read(_SAMPLE_BYTES), np.uint8)
-    compressor = zstandard.ZstdCompressor(level=_LEVEL)
-    plain = len(compressor.compress(sample.data))
-    if plain > 0.97 * len(sample):
-        return 0
-    sizes = {stride: len(compressor.compress(_shuffled(sample, stride).data)) for stride in range(2, _MOST_STRIDE + 1)}
-    best = min(sizes, key=lambda stride: (sizes[stride], stride))
-    if min(plain, sizes[best]) > _PAYS_BELOW * len(sample):
-        return 0
-    return best if sizes[best] < plain else 1
+    return np.frombuffer(source.read(_SAMPLE_BYTES), np.uint8)
 
 
-def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], *, element_bytes: int) -> int:
+def _sample_bytes(sample: NDArray[np.uint8], shuffle: Shuffle) -> int:
+    return len(zstandard.ZstdCompressor(level=_LEVEL).compress(_shuffled(sample, shuffle).data))
+
+
+def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], shuffle: Shuffle) -> int:
     """Compress a value and return the compressed size; 0 if that does not pay.
 
     Args:
@@ -56,7 +89,7 @@ def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], *, element_b
     """
     begin = target.tell()
     chunks = -(-size_bytes // _CHUNK_BYTES)
-    head = _MAGIC + bytes([element_bytes]) + size_bytes.to_bytes(8, "little")
+    head = _MAGIC + shuffle.to_byte() + size_bytes.to_bytes(8, "little")
     target.write(head + bytes(4 * chunks))
     compressor = zstandard.ZstdCompressor(level=_LEVEL)
     lengths = np.zeros(chunks, "<u4")
@@ -66,7 +99,7 @@ def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], *, element_b
         if len(data) < min(left, _CHUNK_BYTES):
             raise EOFError("the value is shorter than it was")
         left -= len(data)
-        lengths[idx] = target.write(compressor.compress(_shuffled(np.frombuffer(data, np.uint8), element_bytes).data))
+        lengths[idx] = target.write(compressor.compress(_shuffled(np.frombuffer(data, np.uint8), shuffle).data))
         if target.tell() - begin > allowed:
             target.seek(begin)
             target.truncate()
@@ -91,9 +124,9 @@ def decompressed_chunks(source: IO[bytes], stored_bytes: int) -> Iterator[NDArra
     head = source.read(len(_MAGIC) + 9)
     if len(head) < len(_MAGIC) + 9 or not head.startswith(_MAGIC):
         raise ValueError("not a compressed value")
-    element_bytes, size_bytes = head[len(_MAGIC)], int.from_bytes(head[len(_MAGIC) + 1 :], "little")
+    shuffle, size_bytes = Shuffle.from_byte(head[len(_MAGIC)]), int.from_bytes(head[len(_MAGIC) + 1 :], "little")
     chunks = -(-size_bytes // _CHUNK_BYTES)
-    if not 1 <= element_bytes <= _MOST_STRIDE or len(head) + 4 * chunks > stored_bytes:
+    if len(head) + 4 * chunks > stored_bytes:
         raise ValueError("a compressed value with a damaged beginning")
     lengths = np.frombuffer(source.read(4 * chunks), "<u4")
     if len(head) + 4 * chunks + int(lengths.sum(dtype=np.uint64)) != stored_bytes:
@@ -108,7 +141,7 @@ def decompressed_chunks(source: IO[bytes], stored_bytes: int) -> Iterator[NDArra
             chunk = np.frombuffer(decompressor.decompress(data), np.uint8)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from error
-        yield _unshuffled(chunk, element_bytes)
+        yield _unshuffled(chunk, shuffle)
 
 
 def decompress(source: IO[bytes], stored_bytes: int, size_bytes: int) -> NDArray[np.uint8]:
@@ -125,25 +158,24 @@ def decompress(source: IO[bytes], stored_bytes: int, size_bytes: int) -> NDArray
     return value
 
 
-def _shuffled(data: NDArray[np.uint8], element_bytes: int) -> NDArray[np.uint8]:
+def _shuffled(data: NDArray[np.uint8], shuffle: Shuffle) -> NDArray[np.uint8]:
     """Return bytes by their place in the element; those of an incomplete element stay at the end."""
-    count = len(data) // element_bytes
-    if element_bytes == 1 or not count:
-        return data
-    shuffled = np.empty_like(data)
-    for byte in range(element_bytes):  # copies from one strided view into another would take ten times as long
-        shuffled[byte * count : (byte + 1) * count] = data[byte : count * element_bytes : element_bytes]
-    shuffled[count * element_bytes :] = data[count * element_bytes :]
-    return shuffled
+    count = len(data) // shuffle.stride
+    whole = count * shuffle.stride
+    ordered = np.empty_like(data)
+    for byte in range(shuffle.stride):  # copies from one strided view into another would take ten times as long
+        ordered[byte * count : (byte + 1) * count] = data[byte : whole : shuffle.stride]
+    ordered[whole:] = data[whole:]
+    return np.diff(ordered, prepend=np.uint8(0)) if shuffle.differences else ordered
 
 
-def _unshuffled(data: NDArray[np.uint8], element_bytes: int) -> NDArray[np.uint8]:
+def _unshuffled(data: NDArray[np.uint8], shuffle: Shuffle) -> NDArray[np.uint8]:
     """Return what `_shuffled` was given."""
-    count = len(data) // element_bytes
-    if element_bytes == 1 or not count:
-        return data
-    plain = np.empty_like(data)
-    for byte in range(element_bytes):
-        plain[byte : count * element_bytes : element_bytes] = data[byte * count : (byte + 1) * count]
-    plain[count * element_bytes :] = data[count * element_bytes :]
+    count = len(data) // shuffle.stride
+    whole = count * shuffle.stride
+    ordered = np.cumsum(data, dtype=np.uint8) if shuffle.differences else data
+    plain = np.empty_like(ordered)
+    for byte in range(shuffle.stride):
+        plain[byte : whole : shuffle.stride] = ordered[byte * count : (byte + 1) * count]
+    plain[whole:] = ordered[whole:]
     return plain

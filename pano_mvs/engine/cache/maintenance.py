@@ -26,9 +26,9 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import make_room, read_regular, whose_temporary
 from pano_mvs.core.paths import is_file, is_link
 from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, element_bytes
-from pano_mvs.engine.cache.compression import stride_of
+from pano_mvs.engine.cache.compression import Shuffle, shuffle_of_array, shuffle_of_file
 from pano_mvs.engine.cache.latest_runs import RunEntry, delete
-from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, RECORD, Packed
+from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, RECORD, Packed, is_compressible
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
@@ -190,9 +190,9 @@ def pack(store: Store) -> int:
     if len(found) < _MIN_PACKED_FILES and sum(value.size_bytes for value, _, _ in found) < _MIN_PACKED_BYTES:
         return 0
     loose = [
-        (Packed(packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s, element_bytes=size), path)
+        (Packed(packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s, shuffle=shuffle), path)
         for value, kind, path in found
-        if (size := _element_bytes(value, kind, path))
+        if (shuffle := _shuffle_of(value, kind, path)) is not None
     ]
     if not loose:
         return 0
@@ -233,13 +233,16 @@ def _packable(store: Store) -> Iterator[tuple[_Value, str]]:
             yield value, FILE
 
 
-def _element_bytes(value: _Value, kind: str, path: Path) -> int:
-    """Return the size of the elements of a value, for compressing it; 0 for a file that stays as it is."""
-    if kind in (RECORD, JSON):
-        return 1
-    with suppress(OSError), path.open("rb") as stream:  # another process may have deleted it
-        return element_bytes(stream) if kind == ARRAY else stride_of(stream, value.size_bytes)
-    return 0
+def _shuffle_of(value: _Value, kind: str, path: Path) -> Shuffle | None:
+    """Return how a value is compressed, if it is at all; None for a file that stays as it is."""
+    with suppress(OSError):  # another process may have deleted it
+        if kind == FILE:
+            with path.open("rb") as stream:
+                return shuffle_of_file(stream, value.size_bytes)
+        if kind == ARRAY and is_compressible(kind, value.size_bytes):
+            with path.open("rb") as stream:
+                return shuffle_of_array(stream, value.size_bytes, stride=element_bytes(stream))
+    return Shuffle()
 
 
 def collect(

@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 from pano_mvs.core.digest import DIGEST_BYTES
 from pano_mvs.core.files import checked_body, read_regular, remove_whole, replacing, write_checked
 from pano_mvs.core.paths import children, is_file, is_link
-from pano_mvs.engine.cache.compression import compress, decompress, decompressed_chunks
+from pano_mvs.engine.cache.compression import Shuffle, compress, decompress, decompressed_chunks
 
 RECORD, ARRAY, JSON, FILE = "record", ".npy", ".json", "file"
 _KINDS = ((RECORD, False), (ARRAY, False), (JSON, False), (ARRAY, True), (FILE, True))
 """The kinds of values by their number in an index, and whether they are compressed."""
 
+DAMAGED = "damaged"  # no digest
 MIN_COMPRESSED_BYTES = 4096
 MAX_COMPRESSED_BYTES = 128_000_000
 _ENTRY = np.dtype(
@@ -51,7 +52,7 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
     kind: str  # `RECORD`, `ARRAY`, `JSON` or `FILE`
     time_s: float = 0.0  # when it was stored, in seconds since the epoch; 0 where this was not asked for
     is_compressed: bool = False  # `size_bytes` is then the compressed size
-    element_bytes: int = 1  # of a value to be compressed: the size of the elements of which it consists
+    shuffle: Shuffle = Shuffle()  # of a value that is to be compressed
 
     @property
     def name(self) -> str:
@@ -104,7 +105,9 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
         return np.memmap(self.pack, np.uint8, "r", self.offset, (self.size_bytes,))
 
     def content_digest(self) -> str:
-        """Return the digest of the value, of which only a part is in memory at a time; "" if it cannot be decompressed.
+        """Return the digest of the value, of which only a part is in memory at a time.
+
+        That of a value that cannot be decompressed is `DAMAGED`.
 
         Raises:
             OSError: if the pack cannot be read.
@@ -119,7 +122,7 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
                 for chunk in decompressed_chunks(stream, self.size_bytes):
                     hasher.update(chunk.data)
             except ValueError:
-                return ""
+                return DAMAGED
         return hasher.hexdigest()
 
 
@@ -323,8 +326,8 @@ def _stored(value: Packed, path: Path | None, out: IO[bytes]) -> tuple[int, bool
                 is_whole = _copy(stream, value, out.write) == value.size_bytes
                 return (value.size_bytes, value.is_compressed) if is_whole else None
         with _opened(path) as stream:
-            if is_compressible(value) and _length(stream) == value.size_bytes:
-                stored = compress(stream, value.size_bytes, out, element_bytes=value.element_bytes)
+            if is_compressible(value.kind, value.size_bytes) and _length(stream) == value.size_bytes:
+                stored = compress(stream, value.size_bytes, out, value.shuffle)
                 if stored or value.kind == FILE:
                     return (stored, True) if stored else None
             is_whole = _copy(stream, Packed(path, 0, value.size_bytes + 1, "", ""), out.write) == value.size_bytes
@@ -333,10 +336,9 @@ def _stored(value: Packed, path: Path | None, out: IO[bytes]) -> tuple[int, bool
         return None
 
 
-def is_compressible(value: Packed) -> bool:
+def is_compressible(kind: str, size_bytes: int) -> bool:
     """Return whether a value is compressed if that pays."""
-    is_moderate = MIN_COMPRESSED_BYTES <= value.size_bytes <= MAX_COMPRESSED_BYTES
-    return value.kind == FILE or (value.kind == ARRAY and is_moderate)
+    return kind == FILE or (kind == ARRAY and MIN_COMPRESSED_BYTES <= size_bytes <= MAX_COMPRESSED_BYTES)
 
 
 def _length(stream: IO[bytes]) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache import compression, maintenance, packs
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
-from pano_mvs.engine.cache.compression import compress, decompress, decompressed_chunks, stride_of
+from pano_mvs.engine.cache.compression import Shuffle, compress, decompress, decompressed_chunks, shuffle_of_file
 from pano_mvs.engine.cache.maintenance import collect, pack, usage_of, verify
 from pano_mvs.engine.cache.packs import Packed
 from pano_mvs.engine.cache.store import LAYOUT_VERSION, Store
@@ -42,14 +42,17 @@ def read(store: Store, ref: BlobRef) -> NDArray[np.generic]:
     return value
 
 
-@given(st.binary(max_size=300), st.integers(1, 64), st.integers(1, 200), st.integers(1, 40))
-def test_what_is_decompressed_is_what_was_compressed(data: bytes, element: int, repeats: int, chunk: int) -> None:
+SHUFFLES = st.builds(Shuffle, st.integers(1, 64), st.booleans())
+
+
+@given(st.binary(max_size=300), SHUFFLES, st.integers(1, 200), st.integers(1, 40))
+def test_what_is_decompressed_is_what_was_compressed(data: bytes, shuffle: Shuffle, repeats: int, chunk: int) -> None:
     value, out = data * repeats, io.BytesIO(b"head")
     out.seek(4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compression, "_CHUNK_BYTES", chunk * 97)
         patch.setattr(compression, "_PAYS_BELOW", 10**9)
-        stored = compress(io.BytesIO(value), len(value), out, element_bytes=element)
+        stored = compress(io.BytesIO(value), len(value), out, shuffle)
         assert out.getvalue()[:4] == b"head"
         assert len(out.getvalue()) == out.tell() == stored + 4 if value else True
         out.seek(4)
@@ -60,7 +63,7 @@ def test_what_is_decompressed_is_what_was_compressed(data: bytes, element: int, 
 @given(st.binary(min_size=1, max_size=60), st.integers(0, 10**6))
 def test_damage_is_an_error_or_other_bytes_but_never_a_crash(junk: bytes, place: int) -> None:
     out = io.BytesIO()
-    stored = compress(io.BytesIO(bytes(5000)), 5000, out, element_bytes=4)
+    stored = compress(io.BytesIO(bytes(5000)), 5000, out, Shuffle(4))
     data = bytearray(out.getvalue())
     begin = place % stored
     data[begin : begin + len(junk)] = junk[: stored - begin]
@@ -73,7 +76,7 @@ def test_damage_is_an_error_or_other_bytes_but_never_a_crash(junk: bytes, place:
 
 def test_a_size_in_a_damaged_chunk_reserves_no_memory() -> None:
     out = io.BytesIO()
-    stored = compress(io.BytesIO(bytes(5000)), 5000, out, element_bytes=1)
+    stored = compress(io.BytesIO(bytes(5000)), 5000, out, Shuffle())
     data = bytearray(out.getvalue())
     data[6:14] = struct.pack("<Q", 1 << 60)
     with pytest.raises(ValueError, match="damaged beginning"):
@@ -83,17 +86,30 @@ def test_a_size_in_a_damaged_chunk_reserves_no_memory() -> None:
         list(decompressed_chunks(io.BytesIO(bytes(data)), stored))
 
 
+def test_differences_are_stored_where_they_are_smaller(tmp_path: Path) -> None:
+    """A ramp has one difference; random numbers of a few values do not become smaller."""
+    store, rng = Store(tmp_path), np.random.default_rng(3)
+    for array, expected in ((np.arange(200_000, dtype=np.int32), True), (rng.integers(0, 3, 200_000, np.uint8), False)):
+        ref = store.blobs.put(array)
+        pack(store)
+        place = place_of(store, ref)
+        with place.pack.open("rb") as stream:
+            stream.seek(place.offset + 5)
+            assert Shuffle.from_byte(stream.read(1)[0]) == Shuffle(array.itemsize, expected)
+        np.testing.assert_array_equal(read(Store(tmp_path), ref), array)
+
+
 def test_what_does_not_pay_leaves_the_file_as_it_was() -> None:
     noise = np.random.default_rng(0).bytes(100_000)
     out = io.BytesIO(b"before")
     out.seek(6)
-    assert compress(io.BytesIO(noise), len(noise), out, element_bytes=4) == 0
+    assert compress(io.BytesIO(noise), len(noise), out, Shuffle(4)) == 0
     assert (out.getvalue(), out.tell()) == (b"before", 6)
 
 
 def test_a_value_that_was_cut_is_not_stored() -> None:
     with pytest.raises(EOFError, match="shorter"):
-        compress(io.BytesIO(bytes(10)), 11, io.BytesIO(), element_bytes=1)
+        compress(io.BytesIO(bytes(10)), 11, io.BytesIO(), Shuffle())
 
 
 @pytest.mark.parametrize("stride", [15, 27])
@@ -103,9 +119,11 @@ def test_the_size_of_the_elements_of_a_file_is_found(stride: int) -> None:
     numbers = rng.normal(5, 0.01, (9000, stride // 4)).astype(np.float32)
     rows[:, : 4 * (stride // 4)] = numbers.view(np.uint8)
     data = b"a header\n" + rows.tobytes()
-    assert stride_of(io.BytesIO(data), len(data)) == stride
+    found = shuffle_of_file(io.BytesIO(data), len(data))
+    assert found is not None
+    assert found.stride == stride
     noise = rng.bytes(300_000)
-    assert stride_of(io.BytesIO(noise), len(noise)) == 0
+    assert shuffle_of_file(io.BytesIO(noise), len(noise)) is None
 
 
 ARRAYS: dict[str, NDArray[np.generic]] = {
@@ -164,6 +182,7 @@ def test_damage_of_a_compressed_array_is_noticed(tmp_path: Path) -> None:
     with pytest.raises(DamagedBlobError, match="is damaged"):
         Store(tmp_path).blobs.get(refs[0])
     assert not store.blobs.exists(refs[0])
+    assert store.blobs.exists(refs[1])
     data[places[1].offset + 200] ^= 1
     places[1].pack.write_bytes(bytes(data))
     assert len(verify(Store(tmp_path)).removed) == 1
