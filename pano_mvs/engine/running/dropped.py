@@ -133,7 +133,7 @@ class DroppedResults:
 
     @property
     def takes_much(self) -> bool:
-        """Whether results that no unit reads any more take so much space that they are dropped during the run."""
+        """Whether results that no unit reads any more take more than `MUCH_BYTES`."""
         stored = self._stored_bytes
         if sum(stored.values()) < MUCH_BYTES or self._again or self._missing:
             return False

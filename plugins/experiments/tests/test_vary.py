@@ -83,13 +83,13 @@ def test_a_grid_of_12_computes_each_distinct_unit_once(toy: Toy, pano_mvs: Comma
 def test_runs_share_what_is_temporary_and_drop_it_when_all_have_ended(tmp_path: Path, pano_mvs: Command) -> None:
     rows = Rows(tmp_path)
     own = ("--out", tmp_path / "v", "--cache", tmp_path / "cache", "--executor", "serial")
-    done = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,7")
+    done = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,8")
     assert done.code == 0, done.text
     found = json.loads((tmp_path / "v" / "vary.json").read_text())
     assert computed(found) == [25, 8, 8]
-    outs = [f"v/capture/value={value}" for value in (5, 6, 7)]
+    outs = [f"v/capture/value={value}" for value in (5, 6, 8)]
     assert [rows.kept(of=out) for out in outs] == [KEPT] * 3
-    again = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,7")
+    again = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,8")
     assert computed(json.loads((tmp_path / "v" / "vary.json").read_text())) == [0, 0, 0], again.text
 
 
