@@ -101,12 +101,13 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     unit = found.units.get(sweep, {}).get(image)
     if unit is None:
         raise InputError(_why_not(plans, sweep, image, session=session))
-    stages = _with_dropped(session, unit[0], [units[image] for units in found.units.values() if image in units], store)
+    stages = [units[image] for units in found.units.values() if image in units]
+    stages = _with_dropped(stages, session, store, sweep=unit[0])
     truth = wanted.truth or _truth_of(session, image)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
 
 
-def _with_dropped(session: Session, sweep: Unit, stages: list[UnitFound], store: Store) -> list[UnitFound]:
+def _with_dropped(stages: list[UnitFound], session: Session, store: Store, *, sweep: Unit) -> list[UnitFound]:
     """Compute again what a run has dropped of the results that are shown; return the units without the rest of these.
 
     The next run drops the results again.

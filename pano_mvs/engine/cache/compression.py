@@ -92,7 +92,7 @@ def _sample_bytes(sample: NDArray[np.uint8], shuffle: Shuffle) -> int:
     return len(zstandard.ZstdCompressor(level=_LEVEL).compress(_shuffled(sample, shuffle).data))
 
 
-def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], shuffle: Shuffle) -> int:
+def compress(source: IO[bytes], size_bytes: int, target: IO[bytes], *, shuffle: Shuffle) -> int:
     """Compress a value and return the compressed size; 0 if that does not pay.
 
     Args:

@@ -327,7 +327,7 @@ def _stored(value: Packed, path: Path | None, out: IO[bytes]) -> tuple[int, bool
                 return (value.size_bytes, value.is_compressed) if is_whole else None
         with _opened(path) as stream:
             if is_compressible(value.kind, value.size_bytes) and _length(stream) == value.size_bytes:
-                stored = compress(stream, value.size_bytes, out, value.shuffle)
+                stored = compress(stream, value.size_bytes, out, shuffle=value.shuffle)
                 if stored or value.kind == FILE:
                     return (stored, True) if stored else None
             is_whole = _copy(stream, Packed(path, 0, value.size_bytes + 1, "", ""), out.write) == value.size_bytes

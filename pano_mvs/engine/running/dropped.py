@@ -24,7 +24,9 @@ _Name = tuple[str, str]  # stage and item
 class DroppedResults:
     """The results of the temporary stages in one pass."""
 
-    def __init__(self, temporary: Mapping[str, frozenset[str]], graph: Graph, store: Store, queue: ReadyQueue) -> None:
+    def __init__(
+        self, temporary: Mapping[str, frozenset[str]], graph: Graph, store: Store, *, queue: ReadyQueue
+    ) -> None:
         """Begin with nothing.
 
         Args:

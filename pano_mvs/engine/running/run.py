@@ -294,7 +294,7 @@ class RunPass:
         # the units that can run, and the results so far
         self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
         self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
-        self.stored = DroppedResults(run.temporary, run.graph, run.store, self.queue)
+        self.stored = DroppedResults(run.temporary, run.graph, run.store, queue=self.queue)
 
     def execute(self) -> None:
         """Settle every unit, and enter into the result how it ended.

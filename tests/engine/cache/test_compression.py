@@ -54,7 +54,7 @@ def test_what_is_decompressed_is_what_was_compressed(data: bytes, shuffle: Shuff
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compression, "_CHUNK_BYTES", chunk * 97)
         patch.setattr(compression, "_PAYS_BELOW", 10**9)
-        stored = compress(io.BytesIO(value), len(value), out, shuffle)
+        stored = compress(io.BytesIO(value), len(value), out, shuffle=shuffle)
         assert out.getvalue()[:4] == b"head"
         assert len(out.getvalue()) == out.tell() == stored + 4 if value else True
         out.seek(4)
@@ -65,7 +65,7 @@ def test_what_is_decompressed_is_what_was_compressed(data: bytes, shuffle: Shuff
 @given(st.binary(min_size=1, max_size=60), st.integers(0, 10**6))
 def test_damage_is_an_error_or_other_bytes_but_never_a_crash(junk: bytes, place: int) -> None:
     out = io.BytesIO()
-    stored = compress(io.BytesIO(bytes(5000)), 5000, out, Shuffle(4))
+    stored = compress(io.BytesIO(bytes(5000)), 5000, out, shuffle=Shuffle(4))
     data = bytearray(out.getvalue())
     begin = place % stored
     data[begin : begin + len(junk)] = junk[: stored - begin]
@@ -78,7 +78,7 @@ def test_damage_is_an_error_or_other_bytes_but_never_a_crash(junk: bytes, place:
 
 def test_a_size_in_a_damaged_chunk_reserves_no_memory() -> None:
     out = io.BytesIO()
-    stored = compress(io.BytesIO(bytes(5000)), 5000, out, Shuffle())
+    stored = compress(io.BytesIO(bytes(5000)), 5000, out, shuffle=Shuffle())
     data = bytearray(out.getvalue())
     data[14:22] = struct.pack("<Q", 1 << 60)
     with pytest.raises(ValueError, match="damaged beginning"):
@@ -109,13 +109,13 @@ def test_what_does_not_pay_leaves_the_file_as_it_was() -> None:
     noise = np.random.default_rng(0).bytes(100_000)
     out = io.BytesIO(b"before")
     out.seek(6)
-    assert compress(io.BytesIO(noise), len(noise), out, Shuffle(4)) == 0
+    assert compress(io.BytesIO(noise), len(noise), out, shuffle=Shuffle(4)) == 0
     assert (out.getvalue(), out.tell()) == (b"before", 6)
 
 
 def test_a_value_that_was_cut_is_not_stored() -> None:
     with pytest.raises(EOFError, match="shorter"):
-        compress(io.BytesIO(bytes(10)), 11, io.BytesIO(), Shuffle())
+        compress(io.BytesIO(bytes(10)), 11, io.BytesIO(), shuffle=Shuffle())
 
 
 @pytest.mark.parametrize("stride", [15, 27])
