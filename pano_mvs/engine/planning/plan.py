@@ -320,6 +320,8 @@ class _DroppedUnits:
             found[name].may_run.append(item)
         moved = {*again, *maybe}
         for plan in plans:
+            in_order = dict.fromkeys((*self._dropped.get(plan.name, ()), *plan.run))
+            plan.run = {item: plan.run[item] for item in in_order if item in plan.run}
             plan.cached = [item for item in plan.cached if (plan.name, item) not in moved]
             plan.dropped = [item for item in self._dropped.get(plan.name, ()) if (plan.name, item) not in moved]
 

@@ -53,7 +53,7 @@ class RunStatistics:
         self._running: dict[str, set[str]] = {}  # stage to its units that are being computed
         self._began: dict[str, float] = {}  # stage to the time since when there are any
         self._source_notes: dict[str, Mapping[str, tuple[str, ...]]] = {}
-        self._again: dict[str, StageEntry] = {}  # stages with units that were computed again
+        self._again: set[str] = set()  # stages with units that were computed again
 
     def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
         """Pass on the names of the images, and keep the notes on each."""
@@ -118,14 +118,14 @@ class RunStatistics:
         """Count a unit as computed that counted as cached, because its result had been dropped."""
         summary = self._summaries[entry.name]
         summary.cached -= 1
-        self._again[entry.name] = entry
+        self._again.add(entry.name)
         for found in (summary.unit_metrics, summary.unit_notes, summary.rejected, summary.doubts):
             found.pop(item, None)
         self.unit_done(entry, item, record, status="run")
 
     def end_pass(self) -> None:
         """Notify the observer of the stages with units that were computed again after the stage had finished."""
-        for name in self._again:
+        for name in sorted(self._again):
             self._observer(self._summaries[name].event())
         self._again.clear()
 

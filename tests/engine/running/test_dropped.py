@@ -73,6 +73,7 @@ def test_a_changed_setting_computes_exactly_what_it_needs_again(rows: Rows) -> N
         "mean": ["dropped after an earlier run; last reads it"],
         "last": ["param value 5.0 → 6.0"],
     }
+    assert list(plan["first"].run) == ["0.txt", "1.txt", "2.txt", "3.txt"]
     result = rows.run("last.value=6")
     assert ran(result) == {"first": 4, "second": 4, "mean": 4, "last": 4, "files": 4}
     assert result.warnings == []
