@@ -49,7 +49,7 @@ from pano_mvs.scene import Record
 _FULL_BELOW_BYTES = 1_000_000
 
 LAYOUT_VERSION = 3
-_READ_LAYOUTS = (2, LAYOUT_VERSION)  # in 2, nothing in packs is compressed
+READ_LAYOUTS = (2, LAYOUT_VERSION)  # in 2, nothing in packs is compressed
 MIN_FREE_BYTES = 200_000_000
 _RUN_MARK = "run-"
 _FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
@@ -451,7 +451,7 @@ class Store:
                 "the cache, delete the file, and nothing is lost; otherwise choose another cache with --cache DIR"
             ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
-        if type(version) is not int or version not in _READ_LAYOUTS:
+        if type(version) is not int or version not in READ_LAYOUTS:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, but this version uses {LAYOUT_VERSION}. "
                 "Choose another cache with --cache DIR"
