@@ -1,9 +1,10 @@
 """Copy a cache to or from another place: a folder, SSH, or an object store, by fsspec.
 
 Files of a cache are never changed, and their names state what they hold, so that a file of the same size is not copied
-again, and an interrupted copy goes on with the same command. Only records grow when their results are dropped. What is copied is checked against its digests first:
-blobs and packs by what they hold, records and lists of runs by the digest in their first line. Values are copied before
-the records and the indexes that name them, so that a copy is a valid cache at any time.
+again, and an interrupted copy goes on with the same command. Only records grow when their results are dropped. What is
+copied is checked against its digests first: blobs and packs by what they hold, records and lists of runs by the digest
+in their first line. Values are copied before the records and the indexes that name them, so that a copy is a valid
+cache at any time.
 """
 
 from __future__ import annotations
