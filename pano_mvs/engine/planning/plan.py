@@ -326,10 +326,10 @@ class _DroppedUnits:
             plan.dropped = [item for item in self._dropped.get(plan.name, ()) if (plan.name, item) not in moved]
 
     def _dropped_inputs(self, unit: Unit) -> Iterator[tuple[str, str]]:
-        for edge, name, ref in items_read(unit, self._graph.edges[unit.entry.name]):
+        for edge, name, _ in items_read(unit, self._graph.edges[unit.entry.name]):
             makers = self._makers.get(edge.producer, {})
             item = makers.get(name, WHOLE) if edge.exploded else name
-            if item in self._dropped.get(edge.producer, {}) and not all(map(self._store.blobs.exists, ref.blobs())):
+            if item in self._dropped.get(edge.producer, {}):
                 yield edge.producer, item
 
     def _followed(self, units: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
