@@ -39,8 +39,7 @@ def drop_unneeded(store: Store) -> int:
     unneeded, needed = set[str](), set[str]()
     for entry in store.runs.each():
         for stage, units in entry.keys.items():
-            is_temporary = stage in entry.temporary and not entry.pinned
-            (unneeded if is_temporary else needed).update(units.values())
+            (unneeded if stage in entry.temporary else needed).update(units.values())  # in a pin, none is temporary
     return _drop(store, unneeded - needed)
 
 
@@ -77,7 +76,7 @@ def drop_results(store: Store, keys: Iterable[str], *, needed: Collection[str]) 
     own = set(keys).difference(needed)
     for entry in store.runs.each():
         for stage, units in entry.keys.items():
-            if entry.pinned or stage not in entry.temporary:
+            if stage not in entry.temporary:
                 own.difference_update(units.values())
     return _drop(store, own)
 

@@ -32,7 +32,7 @@ class RunEntry:
     when: str  # end of the run, ISO 8601, UTC
     keys: Keys
     pinned: bool = False
-    temporary: tuple[str, ...] = ()  # stages whose results the run does not need any more
+    temporary: tuple[str, ...] = ()  # stages whose results the run does not need any more; none of a pin
 
     @property
     def units(self) -> int:

@@ -218,6 +218,12 @@ def test_a_stage_that_is_asked_for_is_computed_again(rows: Rows) -> None:
     assert rows.run(options=RunOptions(until=("last",))).computed == 0
 
 
+def test_stages_that_are_asked_for_are_computed_again_although_others_replace_them(rows: Rows) -> None:
+    rows.run()
+    assert ran(rows.run(options=RunOptions(until=("second", "last")))) == {"first": 4, "second": 4}
+    assert rows.has("second")
+
+
 def test_what_a_failed_unit_reads_stays(rows: Rows) -> None:
     result = rows.run("mean.fails_at=16")
     assert result.exit_code == 3
