@@ -29,6 +29,7 @@ from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
     ImagesOption,
+    KeepOption,
     OnlyOption,
     OutOption,
     RefreshOption,
@@ -124,6 +125,7 @@ class RunArguments:
     durable: Annotated[
         bool, _disk_option("--durable", help="Flush each result to disk, for machines that may lose power.")
     ] = False
+    keep: KeepOption = None
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
     ] = False
@@ -173,7 +175,7 @@ def run(given: RunArguments, options: Mapping[str, tuple[str, ...]] | None = Non
     from pano_mvs.session.session import open_session
 
     limits = tuple(given.until or ()), tuple(given.only or ()), tuple(given.refresh or ())
-    run_options = RunOptions(*limits, given.accept_code, given.keep_going, given.isolate)
+    run_options = RunOptions(*limits, given.accept_code, given.keep_going, given.isolate, given.keep == "all")
     session = open_session(
         given.workflow,
         overrides=given.overrides or [],
@@ -217,6 +219,7 @@ def plan(
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
+    keep: KeepOption = None,
     explain: Annotated[
         str,
         typer.Option(
@@ -235,7 +238,8 @@ def plan(
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import check_output, open_session
 
-    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
+    limits = tuple(until or ()), tuple(only or ()), tuple(refresh or ())
+    run_options = RunOptions(*limits, accept_code, keep_all=keep == "all")
     session = open_session(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )

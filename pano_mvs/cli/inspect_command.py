@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ from rich.table import Table
 
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, StoreError, UsageError
-from pano_mvs.core.paths import is_file
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.text import finite_or_none, shortened_list
+from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import Store, UnitRecord
-from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
+from pano_mvs.engine.planning.temporary import items_read
+from pano_mvs.engine.planning.units import WHOLE, Unit
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.truth import read_truth
 from pano_mvs.results.summary import RunSummary
@@ -27,6 +30,7 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
 from pano_mvs.session.cost_curves import curve_text
 from pano_mvs.session.inspection import Inspection, UnitFound, inspect_pixel
+from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session, run_command
 from pano_mvs.stages.depth import SweepParams
 
@@ -98,8 +102,40 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if unit is None:
         raise InputError(_why_not(plans, sweep, image, session=session))
     stages = [units[image] for units in found.units.values() if image in units]
+    stages = _with_dropped(stages, session, store, sweep=unit[0])
     truth = wanted.truth or _truth_of(session, image)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
+
+
+def _with_dropped(stages: list[UnitFound], session: Session, store: Store, *, sweep: Unit) -> list[UnitFound]:
+    """Compute again what a run has dropped of the results that are shown; return the units without the rest of these.
+
+    The next run drops the results again.
+    """
+
+    def is_missing(refs: Iterable[BlobRef]) -> bool:
+        return not all(map(store.blobs.exists, refs))
+
+    inputs = [
+        f"{edge.producer}:{WHOLE if edge.exploded else name}"
+        for edge, name, ref in items_read(sweep, session.graph.edges[sweep.entry.name])
+        if is_missing(ref.blobs())
+    ]
+    dropped = [unit.label for unit, record in stages if record is not None and is_missing(record.blobs())]
+    if not (inputs or dropped):
+        return stages
+    only = tuple(dict.fromkeys(label.removesuffix(":") for label in (*inputs, *dropped)))
+    Console(stderr=True).say(escape(f"computing again what was dropped: {shortened_list(only, 6)}"))
+    with TemporaryDirectory(prefix="pano-mvs-inspect-") as folder:
+        out = Path(folder) / "out"
+        try:
+            run_session(replace(session, out=out, run_options=RunOptions(only=only)), Execution(executor="serial"))
+            for entry in store.runs.entries():
+                if entry.out == str(resolved(out)):
+                    store.runs.forget(entry)
+        except (StoreError, UsageError) as error:  # such as of a cache that cannot be written
+            Console(stderr=True).say(escape(f"ranges of {shortened_list(dropped, 6)} are missing: {error}"))
+    return [(unit, record) for unit, record in stages if record is None or not is_missing(record.blobs())]
 
 
 def _image(wanted: str, names: Sequence[str]) -> str:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated, Literal, get_type_hints
 
 import typer
 
@@ -87,6 +87,15 @@ RefreshOption = Annotated[
         metavar="STAGE[:ITEM]",
         help="Recompute this stage, group of stages or unit even if it is cached.",
         autocompletion=complete_stage,
+    ),
+]
+KeepOption = Annotated[
+    Literal["all"] | None,
+    typer.Option(
+        "--keep",
+        rich_help_panel="Disk and messages",
+        help="Keep the results of temporary stages, too: all; default: drop them when nothing reads them any more.",
+        show_default=False,
     ),
 ]
 AcceptOption = Annotated[

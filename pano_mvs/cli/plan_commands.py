@@ -73,6 +73,9 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
             console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
         for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
             console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
+    if dropped := sum(len(plan.dropped) for plan in run_plan.stages):
+        whose = plural(dropped, "unit has a result that was", "units have results that were")
+        console.say(f"{dropped} cached {whose} dropped after an earlier run; nothing reads it now")
     _print_total(run_plan, console)
     return run_plan
 
@@ -129,7 +132,8 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
         if (unit.entry.name, unit.item) == (stage, item):
             found.append((unit, record, reason))
 
-    plan = make_plan(workflow, graph, store, visit=look)[-1]
+    temporary = session.run_options.temporary_stages(session.workflow, session.graph)
+    plan = make_plan(workflow, graph, store, visit=look, temporary=temporary)[-1]
     if not found:
         console.say(escape(f"{label}: {_why_not(plan, item)}"))
         return
@@ -167,6 +171,8 @@ def _lines(unit: Unit, record: UnitRecord | None, reason: str, *, store: Store) 
     for name, ref in record.output.parts.items():
         place = store.blobs.place(ref)
         where = place if isinstance(place, Path) else place.name
+        if record.dropped and not store.blobs.exists(ref):
+            where = "dropped after an earlier run; computed again when something reads it"
         lines.append(f"result   {record.output.kind}.{name}: {where} ({ref.size_bytes} bytes)")
     return lines
 

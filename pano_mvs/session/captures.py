@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from pano_mvs.core.errors import InputError, PanoMvsError
+from pano_mvs.engine.cache.dropping import dropping_after
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.results.run_output import RunOutput, load
@@ -47,6 +49,7 @@ def run(
     only: str | Sequence[str] = (),
     refresh: str | Sequence[str] = (),
     keep_going: bool = False,
+    keep: Literal["all"] | None = None,
     progress: Progress | None = None,
     observers: Mapping[str, str | Sequence[str]] | None = None,
     block_size: int | None = None,
@@ -83,6 +86,8 @@ def run(
         only: run only these units, as `STAGE:ITEM`, and those that they need.
         refresh: stages, groups or units to recompute even if they are cached.
         keep_going: continue after failures even if a stage has `on_error: stop`.
+        keep: "all" to keep the results of temporary stages in the cache, too; None to drop them when nothing reads them
+            any more.
         progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
         observers: name of each observer of a plugin that is to receive the events, to the values of its option, such
             as `{"otel": (), "notify": ["ntfy://topic"]}`.
@@ -99,7 +104,7 @@ def run(
         StoreError: if the cache or the output folder cannot be written.
     """
     run_options = RunOptions(
-        as_names(until), as_names(only), as_names(refresh), accept_code=False, keep_going=keep_going
+        as_names(until), as_names(only), as_names(refresh), keep_going=keep_going, keep_all=keep == "all"
     )
     session = open_session(
         workflow,
@@ -207,7 +212,8 @@ def run_blocks(
         try:
             if decision.reason:
                 log(Divided(decision.reason))
-            code = _run_and_merge(_Blocks(session, folder, run_block, log), decision.division, merge)
+            with dropping_after([session.store_root]):  # blocks share images
+                code = _run_and_merge(_Blocks(session, folder, run_block, log), decision.division, merge)
             end = replace(end, exit_code=code, stopped="")
             return code
         except PanoMvsError as error:

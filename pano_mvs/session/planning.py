@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PanoMvsError, StoreError
@@ -95,6 +96,7 @@ def plan(
     until: str | Sequence[str] = (),
     only: str | Sequence[str] = (),
     refresh: str | Sequence[str] = (),
+    keep: Literal["all"] | None = None,
 ) -> RunPlan:
     """Return what `run` would compute with the same arguments; nothing is computed or written.
 
@@ -113,7 +115,7 @@ def plan(
         images=images,
         cache=cache,
         out=out,
-        run_options=RunOptions(as_names(until), as_names(only), as_names(refresh)),
+        run_options=RunOptions(as_names(until), as_names(only), as_names(refresh), keep_all=keep == "all"),
     )
     check_output(session)
     return plan_session(session)

@@ -404,7 +404,7 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
 
 
 def test_layout_of_another_version_is_refused_by_all_commands(finished: Toy, cache: Cache) -> None:
-    for layout in ('{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"):
+    for layout in ('{"layout": 4}', "[]", "{}", "1", "[" * 100_000, "\xff"):
         (finished.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
         before = files_of(finished.folder / "cache")
         for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):

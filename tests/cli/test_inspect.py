@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import ray_from_pixel
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.testing.room import capture_poses, default_room
@@ -270,3 +271,34 @@ def test_a_workflow_without_a_sweep_is_told(tmp_path: Path, run: Path) -> None:
     )
     (tmp_path / "none.yaml").write_text(text)
     assert "no depth.sweep" in call("inspect", tmp_path / "none.yaml", "000.png", 1, 1).flat
+
+
+def test_a_dropped_result_is_computed_again_for_its_pixel(run: Path, tmp_path: Path) -> None:
+    text = WORKFLOW.replace(
+        "sources: depth}}",
+        "sources: depth}, temporary: true}\n  smooth:  {use: filters.median, in: {range_map: checked}}",
+    )
+    (run / "temporary.yaml").write_text(text.replace("{ranges: checked}", "{ranges: smooth}"))
+    options = ("--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    assert call("run", run / "temporary.yaml", *options, "--executor", "serial").code == 0
+    store = Store(tmp_path / "cache")
+    keys = next(store.runs.each()).keys["checked"]
+
+    def is_dropped(image: str) -> bool:
+        return store.find(keys[image]) is None and store.find(keys[image], or_dropped=True) is not None
+
+    assert is_dropped("000.png")
+    found = call("inspect", tmp_path / "out", "000", 40, 28)
+    assert found.code == 0, found.text
+    assert "computing again what was dropped: checked:000.png" in found.flat
+    assert (is_dropped("000.png"), is_dropped("001.png")) == (False, True)
+    again = call("inspect", tmp_path / "out", "000", 40, 28)
+    assert "computing again" not in again.text
+    kept = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache")
+    here = inspected(tmp_path / "out", "000", 40, 28)
+    ranges = [{one["stage"]: one["range"] for one in view["stages"]} for view in (kept, here)]
+    assert ranges[0]["checked"] == ranges[1]["checked"]
+    assert "smooth" in ranges[1]
+    assert len(list(store.runs.each())) == 1, "only that of the run itself is remembered"
+    assert call("run", run / "temporary.yaml", *options, "--executor", "serial").code == 0
+    assert is_dropped("000.png")

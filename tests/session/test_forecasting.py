@@ -93,9 +93,9 @@ def test_what_the_forecast_has_found_is_not_read_again(toy: Toy, monkeypatch: py
     found: list[str] = []
     find = Store.find
 
-    def noted(store: Store, key: str) -> UnitRecord | None:
+    def noted(store: Store, key: str, **options: bool) -> UnitRecord | None:
         found.append(key)
-        return find(store, key)
+        return find(store, key, **options)
 
     monkeypatch.setattr(Store, "find", noted)
     assert run_toy(toy).summary.units.run == 0

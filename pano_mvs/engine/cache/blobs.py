@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,8 @@ from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, dig
 from pano_mvs.core.errors import ChangedFileError, StoreError
 from pano_mvs.core.files import make_room, replacing
 from pano_mvs.core.paths import is_folder, is_link
-from pano_mvs.engine.cache.packs import ARRAY, JSON, Packed, Packs
+from pano_mvs.engine.cache.compression import MOST_STRIDE
+from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, Packed, Packs
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
@@ -33,6 +34,7 @@ FOLDER_DIGITS = 3
 """Number of digits of a key or digest in the name of the folder of its file."""
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
+_MOST_COMPONENTS = 4  # of points, normals, colours
 _MAGIC = np.lib.format.magic(1, 0)
 
 
@@ -78,7 +80,8 @@ class BlobRef:
 class BlobStore:
     """A folder of blobs. External files are found by digest through the paths that were registered in this run.
 
-    A new blob is a file. Arrays and JSON values may be moved into packs later, even while they are in use.
+    A new blob is a file. Arrays, JSON values, and files that can be compressed may be moved into packs later, even
+    while they are in use.
     """
 
     def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
@@ -110,10 +113,22 @@ class BlobStore:
         return self._packed(ref) or self.path(ref)
 
     def _packed(self, ref: BlobRef, *, refresh: bool = False) -> Packed | None:
-        if ref.external or ref.suffix not in (ARRAY, JSON):
+        found = None if ref.external else self.packs.find(ref.digest, refresh=refresh)
+        if found is None or found.kind != (ref.suffix if ref.suffix in (ARRAY, JSON) else FILE):
             return None
-        found = self.packs.find(ref.digest, refresh=refresh)
-        return found if found is not None and found.size_bytes == ref.size_bytes else None
+        return found if found.is_compressed or found.size_bytes == ref.size_bytes else None
+
+    def is_mapped(self, ref: BlobRef) -> bool:
+        """Return whether a part is an array that is memory-mapped when it is loaded; compressed ones are not."""
+        if not ref.is_mapped:
+            return False
+        found = self._packed(ref)
+        return found is None or not found.is_compressed
+
+    def stored_bytes(self, ref: BlobRef) -> int:
+        """Return the size of a blob in the cache."""
+        place = self.place(ref)
+        return place.size_bytes if isinstance(place, Packed) else ref.size_bytes
 
     def _place(self, ref: BlobRef) -> str | Path:
         if ref.external:
@@ -155,6 +170,8 @@ class BlobStore:
             if not self.exists(ref):
                 raise self.discard(ref, "is missing or changed")
             return FilePart(self.path(ref), external=True, digest=ref.digest)
+        if (compressed := self._packed(ref)) is not None and compressed.is_compressed:
+            return self._decompressed(ref, compressed)
         place = self.verified_place(ref)
         try:
             if ref.suffix == ARRAY:
@@ -175,6 +192,26 @@ class BlobStore:
         assert isinstance(place, Path)
         return FilePart(place, digest=ref.digest)
 
+    def _decompressed(self, ref: BlobRef, place: Packed) -> Part:
+        """Return a compressed array, or a file after it was stored as a file of its own."""
+        try:
+            if ref.suffix != ARRAY:
+                self.verified_place(ref)
+                with self._writing(ref) as temporary, temporary.open("wb") as stream:
+                    place.write_to(stream)
+                return FilePart(self.path(ref), digest=ref.digest)
+            data = place.decompressed(ref.size_bytes)
+            if ref not in self._verified and digest_from_bytes(data.data) != ref.digest:
+                raise ValueError("not what was stored")
+            self._verified.add(ref)
+            return _array(data)
+        except FileNotFoundError as error:
+            if self._packed(ref, refresh=True) not in (None, place):  # a run has merged packs meanwhile
+                return self.get(ref)
+            raise self.discard(ref, "is gone") from error
+        except (OSError, ValueError) as error:
+            raise self.discard(ref, f"is damaged ({error})") from error
+
     def copy(self, ref: BlobRef, target: Path) -> None:
         """Copy the bytes of a blob into a file, atomically.
 
@@ -188,7 +225,8 @@ class BlobStore:
                 if isinstance(place, Path):
                     shutil.copyfile(place, temporary)
                 else:
-                    temporary.write_bytes(place.read_bytes())
+                    with temporary.open("wb") as stream:
+                        place.write_to(stream)
         except StoreError:
             if self._packed(ref, refresh=True) not in (None, place):  # it was moved after it had been verified
                 self.copy(ref, target)
@@ -209,6 +247,11 @@ class BlobStore:
         self._verified.discard(ref)
         name = place.name if isinstance(place, Packed) else path
         return DamagedBlobError(f"{name} {why}; the same command computes it again")
+
+    def forget(self, ref: BlobRef) -> Path | Packed:
+        """Return where a blob is that is about to be deleted, and check its bytes again if it is stored again."""
+        self._verified.discard(ref)
+        return self.place(ref)
 
     def verified_place(self, ref: BlobRef) -> Path | Packed:
         """Return where a blob is, after checking its bytes; this object checks each blob once."""
@@ -335,6 +378,21 @@ def _other_format(data: bytes) -> NDArray[Any]:
         raise ValueError(str(error)) from error
     array.flags.writeable = False
     return array
+
+
+def element_bytes(stream: IO[bytes]) -> int:
+    """Return the size of the numbers, or of the points and vectors, in a .npy file; 1 if it is not known."""
+    start = stream.read(len(_MAGIC) + 2)
+    if not start.startswith(_MAGIC):
+        return 1
+    try:
+        length = start[len(_MAGIC) :]
+        shape, dtype, fortran_order = _header(length + stream.read(int.from_bytes(length, "little")))
+    except ValueError:
+        return 1
+    is_vector = len(shape) >= 2 and shape[-1] <= _MOST_COMPONENTS and not fortran_order
+    size_bytes = dtype.itemsize * (max(1, shape[-1]) if is_vector else 1)
+    return size_bytes if size_bytes <= MOST_STRIDE else 1
 
 
 @lru_cache(maxsize=4096)

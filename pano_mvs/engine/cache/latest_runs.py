@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,6 +32,7 @@ class RunEntry:
     when: str  # end of the run, ISO 8601, UTC
     keys: Keys
     pinned: bool = False
+    temporary: tuple[str, ...] = ()  # stages whose results the run does not need any more; none of a pin
 
     @property
     def units(self) -> int:
@@ -49,10 +50,22 @@ class RunHistory:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def remember(self, workflow_id: str, keys: Keys, *, workflow: str, out: Path, finished: bool = True) -> None:
+    def remember(
+        self,
+        workflow_id: str,
+        keys: Keys,
+        *,
+        workflow: str,
+        out: Path,
+        finished: bool = True,
+        temporary: Iterable[str] = (),
+    ) -> None:
         """Store the keys of a run, replacing those of the last run of the same workflow into the same folder.
 
         If the run did not finish, the earlier keys of the units that it had not reached are kept.
+
+        Args:
+            temporary: stages whose results the run does not need any more; see `dropping`.
         """
         name = f"{workflow_id[:16]}-{digest_from_value(str(resolved(out)))[:16]}"
         if not finished:
@@ -60,7 +73,7 @@ class RunHistory:
             before = own.keys if own is not None else self.last_keys(workflow_id)
             keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
         when = datetime.now(UTC).isoformat(timespec="seconds")
-        self._write("runs", RunEntry(name, workflow, str(resolved(out)), when, keys))
+        self._write("runs", RunEntry(name, workflow, str(resolved(out)), when, keys, temporary=tuple(temporary)))
 
     def last_keys(self, workflow_id: str) -> Keys:
         """Return the keys of the latest run of a workflow; empty if there is none."""
@@ -132,6 +145,7 @@ class RunHistory:
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
+        value |= {"temporary": sorted(entry.temporary)} if entry.temporary else {}
         path = self.root / folder / f"{entry.name}.json"
         write_checked(path, json.dumps(value, sort_keys=True).encode(), temporary_in=self.root / "tmp")
 
@@ -154,6 +168,7 @@ def _read(path: Path) -> RunEntry | None:
         if datetime.fromisoformat(when).utcoffset() is None or not "1970" < when[:4] < "9999":
             raise ValueError("not the time of a run")
         keys = {str(stage): {str(item): str(key) for item, key in of.items()} for stage, of in value["keys"].items()}
-        return RunEntry(path.stem, workflow, out, when, keys, pinned=path.parent.name == "pins")
+        temporary = tuple(map(str, value.get("temporary", ())))
+        return RunEntry(path.stem, workflow, out, when, keys, path.parent.name == "pins", temporary)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

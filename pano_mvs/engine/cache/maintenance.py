@@ -1,7 +1,8 @@
 """Maintenance of a cache: its contents by stage, verification, packing, and garbage collection.
 
-Packing moves records, arrays and JSON values from files of their own into packs, so that large captures take few files.
-Values are found in the packs before their files are removed, so that runs may use the cache meanwhile.
+Packing moves records, arrays and JSON values from files of their own into packs, so that large captures take few files,
+and compresses arrays there, and files where that pays. Values are found in the packs before their files are removed, so
+that runs may use the cache meanwhile.
 
 Garbage collection keeps what the remembered runs and pins name, and deletes everything else that is older than a given
 age. It takes no lock: what a run has just computed is too recent to be deleted, and a run computes again what is
@@ -24,14 +25,17 @@ from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import make_room, read_regular, whose_temporary
 from pano_mvs.core.paths import is_file, is_link
-from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, element_bytes
+from pano_mvs.engine.cache.compression import Shuffle, shuffle_of_array, shuffle_of_file
 from pano_mvs.engine.cache.latest_runs import RunEntry, delete
-from pano_mvs.engine.cache.packs import ARRAY, JSON, RECORD, Packed
+from pano_mvs.engine.cache.packs import ARRAY, FILE, JSON, RECORD, Packed, is_compressible
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
 _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
-_MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can read them
+_MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can read them, …
+_MIN_FILE_BYTES = 1 << 16  # of a file to be compressed
+_MIN_PACKED_BYTES = 8_000_000  # … unless they are larger than this
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class StageUsage:
 
     stage: str  # name of the stage in the registry
     units: int
-    size_bytes: int  # size of their blobs; a blob that several units share counts once
+    size_bytes: int  # size of their blobs in the cache; a blob that several units share counts once
     seconds: float
 
 
@@ -98,7 +102,7 @@ def usage_of(store: Store) -> list[StageUsage]:
         for ref in record.own_blobs():
             if ref.digest not in seen:
                 seen.add(ref.digest)
-                total[1] += ref.size_bytes
+                total[1] += store.blobs.stored_bytes(ref)
     found = [StageUsage(name, int(units), int(size), seconds) for name, (units, size, seconds) in totals.items()]
     return sorted(found, key=lambda usage: (-usage.size_bytes, usage.stage))
 
@@ -173,23 +177,29 @@ def _verify_record(store: Store, value: _Value, data: bytes, *, found: Verificat
 
 
 def pack(store: Store) -> int:
-    """Move records, arrays and JSON values from files of their own into packs; return how many files were removed.
+    """Move values from files of their own into packs, and compress them; return how many files were removed.
 
-    Nothing is done below a few hundred files. Runs may use the cache at the same time.
+    Few and small files stay as they are, and so do files that cannot be compressed. Runs may use the cache at the same
+    time.
 
     Raises:
         StoreError: if a file cannot be read, written or removed.
     """
-    loose = [
-        (Packed(store.blobs.packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s), value.place)
-        for value, kind in _packable(store)
-        if isinstance(value.place, Path)
-    ]
-    if len(loose) < _MIN_PACKED_FILES:
-        return 0
     packs = store.blobs.packs
+    found = [(value, kind, value.place) for value, kind in _packable(store) if isinstance(value.place, Path)]
+    if len(found) < _MIN_PACKED_FILES and sum(value.size_bytes for value, _, _ in found) < _MIN_PACKED_BYTES:
+        return 0
+    loose = [
+        (Packed(packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s, shuffle=shuffle), path)
+        for value, kind, path in found
+        if (shuffle := _shuffle_of(value, kind, path)) is not None
+    ]
+    if not loose:
+        return 0
+    store.mark_layout()
     small = _merged(packs.times(), sum(value.size_bytes for value, _ in loose))
-    packs.add(chain(loose, ((value, None) for value in packs.each() if value.pack in small)))
+    new = (item for item in loose if item[0].kind != FILE or packs.find(item[0].digest) is None)  # it was unpacked
+    packs.add(chain(list(new), ((value, None) for value in packs.each() if value.pack in small)))
     for value, path in loose:
         if packs.find(value.digest) is not None:
             delete(path)
@@ -219,6 +229,20 @@ def _packable(store: Store) -> Iterator[tuple[_Value, str]]:
     for value in _blobs(store):
         if isinstance(value.place, Path) and value.place.suffix in (ARRAY, JSON):
             yield value, value.place.suffix
+        elif isinstance(value.place, Path) and value.size_bytes >= _MIN_FILE_BYTES:
+            yield value, FILE
+
+
+def _shuffle_of(value: _Value, kind: str, path: Path) -> Shuffle | None:
+    """Return how a value is compressed, if it is at all; None for a file that stays as it is."""
+    with suppress(OSError):  # another process may have deleted it
+        if kind == FILE:
+            with path.open("rb") as stream:
+                return shuffle_of_file(stream, value.size_bytes)
+        if kind == ARRAY and is_compressible(kind, value.size_bytes):
+            with path.open("rb") as stream:
+                return shuffle_of_array(stream, value.size_bytes, stride=element_bytes(stream))
+    return Shuffle()
 
 
 def collect(
@@ -249,7 +273,7 @@ def collect(
             found.records.append(value.place)
             found.size_bytes += value.size_bytes
         else:
-            kept_blobs.update(_packed(ref.digest) for ref in record.blobs())
+            kept_blobs.update(_packed(ref.digest) for ref in record.lasting_blobs())
     unfinished = (
         _Value(path, "", stat.st_size, stat.st_mtime)
         for path in store.blobs.packs.without_index()
@@ -297,6 +321,12 @@ def _packed(digest: str) -> bytes:
     Even among millions of digests no two begin alike. If two did, one file too many would be kept.
     """
     return bytes.fromhex(digest[:DIGEST_BYTES]) if IS_DIGEST.fullmatch(digest) else b""
+
+
+def each_record(store: Store) -> Iterator[tuple[str, bytes]]:
+    """Yield the key and the bytes of every record, whether or not it is intact."""
+    for value in _records(store):
+        yield value.digest, _read(value.place) or b""
 
 
 def _records(store: Store) -> Iterator[_Value]:

@@ -1,9 +1,12 @@
-"""Packs: the bytes of many records, arrays and JSON values in one file, so that large captures take few files.
+"""Packs: the bytes of many records, arrays, JSON values and files in one file, so that large captures take few files.
 
 A pack is `packs/<name>.pack`, with one value after the other, each at a multiple of 64 bytes, so that arrays can be
 memory-mapped. `packs/<name>.index` lists them, below a digest of the list; it is written after the pack, so a pack
 without an index is the rest of a process that was killed. Both get their names by renaming. A pack is never changed;
 to remove a value, its index is replaced by one without the value.
+
+Arrays and files are compressed where that pays (`pano_mvs.engine.cache.compression`), and arrays that are larger than
+`MAX_COMPRESSED_BYTES` are not, so that they can be memory-mapped and need not fit into memory.
 """
 
 from __future__ import annotations
@@ -23,9 +26,15 @@ from numpy.typing import NDArray
 from pano_mvs.core.digest import DIGEST_BYTES
 from pano_mvs.core.files import checked_body, read_regular, remove_whole, replacing, write_checked
 from pano_mvs.core.paths import children, is_file, is_link
+from pano_mvs.engine.cache.compression import Shuffle, compress, decompress, decompressed_chunks
 
-RECORD, ARRAY, JSON = "record", ".npy", ".json"
-_KINDS = (RECORD, ARRAY, JSON)
+RECORD, ARRAY, JSON, FILE = "record", ".npy", ".json", "file"
+_KINDS = ((RECORD, False), (ARRAY, False), (JSON, False), (ARRAY, True), (FILE, True))
+"""The kinds of values by their number in an index, and whether they are compressed."""
+
+DAMAGED = "damaged"  # no digest
+MIN_COMPRESSED_BYTES = 4096
+MAX_COMPRESSED_BYTES = 128_000_000
 _ENTRY = np.dtype(
     [("high", ">u8"), ("low", ">u8"), ("offset", "<u8"), ("size", "<u8"), ("time", "<f8"), ("kind", "u1")]
 )
@@ -40,16 +49,19 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
     offset: int
     size_bytes: int
     digest: str  # of a blob, or the key of a record
-    kind: str  # `RECORD`, `ARRAY` or `JSON`
+    kind: str  # `RECORD`, `ARRAY`, `JSON` or `FILE`
     time_s: float = 0.0  # when it was stored, in seconds since the epoch; 0 where this was not asked for
+    is_compressed: bool = False  # `size_bytes` is then the compressed size
+    shuffle: Shuffle = Shuffle()  # of a value that is to be compressed
 
     @property
     def name(self) -> str:
         """The pack and the name of the value in it, for messages."""
-        return f"{self.pack}:{self.digest}{'.json' if self.kind == RECORD else self.kind}"
+        suffix = {RECORD: ".json", FILE: ""}.get(self.kind, self.kind)
+        return f"{self.pack}:{self.digest}{suffix}"
 
     def read_bytes(self) -> bytes:
-        """Return the bytes; fewer if the pack has been cut.
+        """Return the bytes as they are stored; fewer if the pack has been cut.
 
         Raises:
             OSError: if the pack cannot be read.
@@ -57,6 +69,32 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
         with _opened(self.pack) as stream:
             stream.seek(self.offset)
             return stream.read(self.size_bytes)
+
+    def decompressed(self, size_bytes: int) -> NDArray[np.uint8]:
+        """Return the bytes of a compressed value of which the size is known.
+
+        Raises:
+            OSError: if the pack cannot be read.
+            ValueError: if the value is damaged.
+        """
+        with _opened(self.pack) as stream:
+            stream.seek(self.offset)
+            return decompress(stream, self.size_bytes, size_bytes)
+
+    def write_to(self, target: IO[bytes]) -> None:
+        """Write the bytes of the value into a file, of which only a part is in memory at a time.
+
+        Raises:
+            OSError: if the pack cannot be read.
+            ValueError: if the value is damaged.
+        """
+        with _opened(self.pack) as stream:
+            if not self.is_compressed:
+                _copy(stream, self, target.write)
+                return
+            stream.seek(self.offset)
+            for chunk in decompressed_chunks(stream, self.size_bytes):
+                target.write(chunk.data)
 
     def mapped(self) -> NDArray[np.uint8]:
         """Return the bytes memory-mapped and read-only.
@@ -67,14 +105,24 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
         return np.memmap(self.pack, np.uint8, "r", self.offset, (self.size_bytes,))
 
     def content_digest(self) -> str:
-        """Return the digest of the bytes, of which only a part is in memory at a time.
+        """Return the digest of the value, of which only a part is in memory at a time.
+
+        That of a value that cannot be decompressed is `DAMAGED`.
 
         Raises:
             OSError: if the pack cannot be read.
         """
         hasher = hashlib.blake2b(digest_size=DIGEST_BYTES)
         with _opened(self.pack) as stream:
-            _copy(stream, self, hasher.update)
+            if not self.is_compressed:
+                _copy(stream, self, hasher.update)
+                return hasher.hexdigest()
+            stream.seek(self.offset)
+            try:
+                for chunk in decompressed_chunks(stream, self.size_bytes):
+                    hasher.update(chunk.data)
+            except ValueError:
+                return DAMAGED
         return hasher.hexdigest()
 
 
@@ -104,7 +152,8 @@ class Packs:
             if found_high != high:
                 break
             if found_low == low:
-                return Packed(packs[pack], offset, size, digest, _KINDS[kind])
+                name, is_compressed = _KINDS[kind]
+                return Packed(packs[pack], offset, size, digest, name, is_compressed=is_compressed)
         return None
 
     def each(self) -> Iterator[Packed]:
@@ -149,10 +198,11 @@ class Packs:
                     value, path = following
                     out.write(bytes(-out.tell() % 64))  # the alignment of arrays in memory, and so of .npy headers
                     offset = out.tell()
-                    if _copied(value, path, out):
+                    if (stored := _stored(value, path, out)) is not None:
                         used_s = max(value.time_s, _mtime(value.pack) if path is None else 0.0)
-                        kind = _KINDS.index(value.kind)
-                        entries.append((*_halves(value.digest), offset, value.size_bytes, used_s, kind))
+                        size_bytes, is_compressed = stored
+                        kind = _KINDS.index((value.kind, is_compressed))
+                        entries.append((*_halves(value.digest), offset, size_bytes, used_s, kind))
                     else:
                         out.seek(offset)
                         out.truncate()
@@ -242,7 +292,8 @@ def values_of(pack: Path, index: Path) -> Iterator[Packed]:
 
 def _values(pack: Path, entries: NDArray[Any]) -> Iterator[Packed]:
     for high, low, offset, size, time_s, kind in entries.tolist():
-        yield Packed(pack, offset, size, f"{high:016x}{low:016x}", _KINDS[kind], time_s)
+        name, is_compressed = _KINDS[kind]
+        yield Packed(pack, offset, size, f"{high:016x}{low:016x}", name, time_s, is_compressed)
 
 
 def _table(indexes: list[NDArray[Any]]) -> NDArray[Any]:
@@ -263,16 +314,39 @@ def _read_index(path: Path) -> NDArray[Any] | None:
     return entries if (entries["kind"] < len(_KINDS)).all() else None
 
 
-def _copied(value: Packed, path: Path | None, out: IO[bytes]) -> bool:
-    """Append the bytes of a value to a pack; return False if it is gone, or has another length."""
+def _stored(value: Packed, path: Path | None, out: IO[bytes]) -> tuple[int, bool] | None:
+    """Append a value to a pack, compressed if that pays.
+
+    Returns:
+        The size in the pack and whether it is compressed; None if the value is gone, or has another length.
+    """
     try:
         if path is None:
             with _opened(value.pack) as stream:
-                return _copy(stream, value, out.write) == value.size_bytes
+                is_whole = _copy(stream, value, out.write) == value.size_bytes
+                return (value.size_bytes, value.is_compressed) if is_whole else None
         with _opened(path) as stream:
-            return _copy(stream, Packed(path, 0, value.size_bytes + 1, "", ""), out.write) == value.size_bytes
-    except FileNotFoundError:
-        return False
+            if is_compressible(value.kind, value.size_bytes) and _length(stream) == value.size_bytes:
+                stored = compress(stream, value.size_bytes, out, shuffle=value.shuffle)
+                if stored or value.kind == FILE:
+                    return (stored, True) if stored else None
+            is_whole = _copy(stream, Packed(path, 0, value.size_bytes + 1, "", ""), out.write) == value.size_bytes
+            return (value.size_bytes, False) if is_whole else None
+    except (FileNotFoundError, EOFError):
+        return None
+
+
+def is_compressible(kind: str, size_bytes: int) -> bool:
+    """Return whether a value is compressed if that pays."""
+    return kind == FILE or (kind == ARRAY and MIN_COMPRESSED_BYTES <= size_bytes <= MAX_COMPRESSED_BYTES)
+
+
+def _length(stream: IO[bytes]) -> int:
+    """Return the size of an open file, which is then at its beginning."""
+    stream.seek(0, os.SEEK_END)
+    size_bytes = stream.tell()
+    stream.seek(0)
+    return size_bytes
 
 
 def _copy(stream: IO[bytes], value: Packed, write: Callable[[bytes], object]) -> int:

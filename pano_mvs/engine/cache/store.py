@@ -16,7 +16,8 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,15 +41,17 @@ from pano_mvs.core.files import (
 from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
 from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, BlobRef, BlobStore, DamagedBlobError, PackedRefs, refuse_link
 from pano_mvs.engine.cache.latest_runs import RunHistory
-from pano_mvs.engine.cache.packs import RECORD, Packed
+from pano_mvs.engine.cache.packs import JSON, RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
 
 _FULL_BELOW_BYTES = 1_000_000
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
+READ_LAYOUTS = (2, LAYOUT_VERSION)  # in 2, nothing in packs is compressed
 MIN_FREE_BYTES = 200_000_000
+_RUN_MARK = "run-"
 _FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
 
 
@@ -81,6 +84,10 @@ class ItemRef:
     def parts(self) -> PackedRefs:
         """The parts of the value by name."""
         return PackedRefs.from_packed(self._form, self._packed[DIGEST_BYTES:])
+
+    def blobs(self) -> Iterable[BlobRef]:
+        """Return the blobs of its parts."""
+        return self.parts.values()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ItemRef):
@@ -121,10 +128,13 @@ class UnitRecord:
     # image name to the reason why the result is doubtful there
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
+    # whether a run has dropped its arrays and files: they may be missing, and are computed again when they are read
+    dropped: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a JSON value."""
         return {
+            **({"dropped": True} if self.dropped else {}),
             "key": self.key,
             "identity": self.identity,
             "output": self.output.to_json(),
@@ -160,6 +170,7 @@ class UnitRecord:
             rejected={str(name): str(reason) for name, reason in rejected.items()},
             doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
+            dropped=value.get("dropped") is True,
         )
 
     def blobs(self) -> Iterator[BlobRef]:
@@ -168,8 +179,17 @@ class UnitRecord:
             yield from item.parts.values()
 
     def own_blobs(self) -> Iterator[BlobRef]:
-        """Yield the blobs in the cache, without files of the user."""
-        return (ref for ref in self.blobs() if not ref.external)
+        """Yield the blobs that the record keeps in the cache: no files of the user, and nothing that was dropped."""
+        return (ref for ref in self.lasting_blobs() if not ref.external)
+
+    def lasting_blobs(self) -> Iterator[BlobRef]:
+        """Yield all blobs without those that were dropped: JSON values stay, since they are small."""
+        return (ref for ref in self.blobs() if not (self.dropped and is_droppable(ref)))
+
+
+def is_droppable(ref: BlobRef) -> bool:
+    """Return whether a blob goes when its result is dropped: an array or a file in the cache."""
+    return not ref.external and ref.suffix != JSON
 
 
 class Store:
@@ -205,12 +225,18 @@ class Store:
         """Whether no unit has a record."""
         return not children(self.root / "records") and not children(self.blobs.packs.folder)
 
-    def find(self, key: str) -> UnitRecord | None:
-        """Return the record of a key if it is intact and all its blobs exist, otherwise None."""
+    def find(self, key: str, *, or_dropped: bool = False) -> UnitRecord | None:
+        """Return the record of a key if it is intact and all its blobs exist, otherwise None.
+
+        Args:
+            or_dropped: also return a record whose blobs a run has dropped. Its digests are known, so that the units
+                that read it have keys, but it cannot be loaded.
+        """
         record = self.read_record(key)
         if record is None:
             return None
-        return record if all(self.blobs.exists(ref) for ref in record.blobs()) else None
+        needed = record.lasting_blobs() if or_dropped else record.blobs()
+        return record if all(map(self.blobs.exists, needed)) else None
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key, whether or not its blobs exist; None if it is missing or damaged."""
@@ -246,6 +272,18 @@ class Store:
         """Write a record; its blobs must already exist."""
         if (packed := self.packed_record(record.key)) is not None:  # it could not be used
             self.blobs.packs.forget([packed])
+        self._write(record)
+
+    def replace(self, records: Iterable[UnitRecord]) -> None:
+        """Write records in place of those that have their keys; others see the old or the new ones meanwhile."""
+        packed = list[Packed]()
+        for record in records:
+            self._write(record)
+            if (old := self.packed_record(record.key)) is not None:
+                packed.append(old)
+        self.blobs.packs.forget(packed)
+
+    def _write(self, record: UnitRecord) -> None:
         body = json.dumps(record.to_json(), sort_keys=True).encode()
         path = self.record_path(record.key)
         refuse_link(path)
@@ -297,6 +335,27 @@ class Store:
         except DamagedBlobError as error:
             self.damaged.append(str(error))
             raise
+
+    @contextmanager
+    def in_use(self) -> Iterator[Callable[[], bool]]:
+        """Mark the cache as used by a run, and yield a function that returns whether no other run uses it.
+
+        Runs drop results only while no other one uses the cache, which might be about to read them.
+        """
+        mark = self.blobs.temporary / f"{temporary_prefix()}{_RUN_MARK}{uuid.uuid4().hex}"
+        with suppress(OSError, StoreError):  # a cache of other users can be read, not written
+            make_folder(mark.parent)
+            mark.touch()
+
+        def is_alone() -> bool:
+            clear_abandoned(self.blobs.temporary)
+            return not any(path != mark for path in children(self.blobs.temporary, f"*-{_RUN_MARK}*"))
+
+        try:
+            yield is_alone
+        finally:
+            with suppress(OSError):
+                mark.unlink(missing_ok=True)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -392,7 +451,7 @@ class Store:
                 "the cache, delete the file, and nothing is lost; otherwise choose another cache with --cache DIR"
             ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
-        if type(version) is not int or version != LAYOUT_VERSION:
+        if type(version) is not int or version not in READ_LAYOUTS:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, but this version uses {LAYOUT_VERSION}. "
                 "Choose another cache with --cache DIR"
@@ -401,6 +460,17 @@ class Store:
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
+
+    def mark_layout(self) -> None:
+        """State the layout of this version before anything is stored that an earlier one cannot read.
+
+        Raises:
+            StoreError: if the cache cannot be written.
+        """
+        path = self.root / "layout.json"
+        text = json.dumps({"layout": LAYOUT_VERSION})
+        if read_regular(path) != text.encode():
+            write_text(path, text)
 
     def _create(self, path: Path) -> None:
         try:

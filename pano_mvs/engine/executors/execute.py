@@ -35,7 +35,7 @@ from pano_mvs.core.errors import (
 from pano_mvs.core.files import make_folder
 from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import error_text, shortened
-from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.capture import captured
 from pano_mvs.engine.executors.protocol import JobOutcome
@@ -202,15 +202,23 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
     refs = {(pair_from_name(name) if port.kind.axis is Axis.PAIR else name): ref for name, ref in value.items()}
-    return LazyMapping(refs, partial(store.load, kind=port.kind), max_kept=max_kept_items(value.values()))
+    return LazyMapping(
+        refs, partial(store.load, kind=port.kind), max_kept=max_kept_items(value.values(), store.blobs.is_mapped)
+    )
 
 
-def max_kept_items(refs: Iterable[ItemRef]) -> int:
-    """Return how many loaded items to keep, so that even the largest ones respect the limits on files and memory."""
+def max_kept_items(refs: Iterable[ItemRef], is_mapped: Callable[[BlobRef], bool]) -> int:
+    """Return how many loaded items to keep, so that even the largest ones respect the limits on files and memory.
+
+    Args:
+        is_mapped: whether a part is memory-mapped; see `BlobStore.is_mapped`.
+    """
     opened, read = 0, 1
     for ref in refs:
-        opened = max(opened, sum(part.is_mapped for part in ref.parts.values()))
-        read = max(read, sum(part.size_bytes for part in ref.parts.values() if not part.is_mapped))
+        mapped = [is_mapped(part) for part in ref.parts.values()]
+        opened = max(opened, sum(mapped))
+        sizes = (part.size_bytes for part, is_open in zip(ref.parts.values(), mapped, strict=True) if not is_open)
+        read = max(read, sum(sizes))
     by_memory = max(1, 128_000_000 // read)
     # A process may open only about a thousand files, and a stage may read several kinds.
     return min(by_memory, max(1, 128 // opened)) if opened else by_memory

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.planning.temporary import items_read, temporary_stages
 from pano_mvs.engine.planning.unit_keys import SourceListing, resolve
-from pano_mvs.engine.planning.units import OF_CODE, StageState, Unit
+from pano_mvs.engine.planning.units import OF_CODE, WHOLE, StageState, Unit
+from pano_mvs.engine.stages.stage import Cardinality
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 
@@ -29,6 +32,7 @@ class RunOptions:
     accept_code: bool = False
     keep_going: bool = False  # go on after a failed unit even if its stage says `on_error: stop`
     isolate: bool = False  # compute each unit of a plugin's stage in a process of its own
+    keep_all: bool = False  # drop no results, as if no stage were temporary
 
     @property
     def is_partial(self) -> bool:
@@ -54,6 +58,17 @@ class RunOptions:
         ends = until | set(map(_stage, self.only))
         return workflow, graph.limited_to(ends, _items_by_stage(self.only)) if ends else graph
 
+    def temporary_stages(self, workflow: Workflow, graph: Graph) -> dict[str, frozenset[str]]:
+        """Return each stage whose results the run may drop with the stages that read it; see `temporary_stages`.
+
+        Args:
+            workflow: and the graph, as `applied_to` returns them.
+        """
+        if self.keep_all:
+            return {}
+        until = {stage for name in self.until for stage in stages_named(name, workflow)}
+        return temporary_stages(workflow, graph, wanted=until | set(map(_stage, self.only)))
+
     def refreshes(self, unit: Unit) -> bool:
         """Return whether a unit is computed again even if it is cached."""
         entry = unit.entry
@@ -65,16 +80,24 @@ class RunOptions:
         """What may name a group."""
         return (*self.until, *self.refresh)
 
-    def accepted(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
+    def accepted(
+        self, unit: Unit, last_key: str | None, store: Store, *, or_dropped: bool = False
+    ) -> UnitRecord | None:
         """Return what `acceptable` returns, and store it under the new key, so that the next run finds it."""
-        record = self.acceptable(unit, last_key, store)
+        record = self.acceptable(unit, last_key, store, or_dropped=or_dropped)
         if record is not None:
             store.put(record)
         return record
 
-    def acceptable(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
-        """Return the record of the last run for a unit if only code or libraries changed and `accept_code` is set."""
-        last = store.find(last_key) if self.accept_code and last_key else None
+    def acceptable(
+        self, unit: Unit, last_key: str | None, store: Store, *, or_dropped: bool = False
+    ) -> UnitRecord | None:
+        """Return the record of the last run for a unit if only code or libraries changed and `accept_code` is set.
+
+        Args:
+            or_dropped: whether the result may have been dropped; see `Store.find`.
+        """
+        last = store.find(last_key, or_dropped=or_dropped) if self.accept_code and last_key else None
         if last is None or not only_the_code_differs(last.identity, unit.identity):
             return None
         return dataclasses.replace(last, key=unit.key, identity=unit.identity)
@@ -117,9 +140,11 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     """
     if last_key is None:
         return "new"
-    if last_key == unit.key:
-        return "its cached result is missing or damaged, or it did not finish"
     last = store.read_record(last_key)
+    if last_key == unit.key:
+        if last is not None and last.dropped:
+            return "dropped after an earlier run, and to be kept now"
+        return "its cached result is missing or damaged, or it did not finish"
     if last is None:
         return "changed (the record of the last run is missing)"
     before, now = last.identity, unit.identity
@@ -194,6 +219,7 @@ class StagePlan:
     name: str
     use: str
     cached: list[str] = field(default_factory=list)
+    dropped: list[str] = field(default_factory=list)  # those of `cached` whose results were dropped and nothing reads
     run: dict[str, str] = field(default_factory=dict)  # unit that would be computed, to the reason
     # units that depend on units that would be computed; they run if these give other results
     may_run: list[str] = field(default_factory=list)
@@ -210,6 +236,7 @@ def make_plan(
     listing: SourceListing | None = None,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
     failed: Collection[tuple[str, str]] = (),
+    temporary: Collection[str] | None = None,
 ) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
 
@@ -217,11 +244,14 @@ def make_plan(
         listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
         failed: stages and units that have no result; by default, all units are expected to have one.
+        temporary: stages whose results may have been dropped; None for those of the options.
 
     Raises:
         InputError: if the source cannot be listed.
     """
     last = store.runs.last_keys(workflow.id)
+    temporary = options.temporary_stages(workflow, graph) if temporary is None else temporary
+    drops = _DroppedUnits(graph, store)
     states: dict[str, StageState] = {}
     plans: list[StagePlan] = []
     for name in graph.order:
@@ -230,7 +260,11 @@ def make_plan(
         plan = StagePlan(name, entry.spec.name)
         for unit in resolve(entry, graph, states=states, store=store, listing=listing):
             last_key, is_asked = last.get(name, {}).get(unit.item), options.refreshes(unit)
-            record = None if is_asked else store.find(unit.key) or options.acceptable(unit, last_key, store)
+            record = None
+            if not is_asked:
+                may_drop = name in temporary
+                record = store.find(unit.key, or_dropped=may_drop)
+                record = record or options.acceptable(unit, last_key, store, or_dropped=may_drop)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
@@ -239,12 +273,89 @@ def make_plan(
             else:
                 state.pending.add(unit.item)
                 plan.run[unit.item] = "--refresh" if is_asked else reason_to_run(unit, last_key, store)
+            drops.look(unit, record, state)
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
         plan.may_run = [item for item in state.members if item in state.pending and item not in plan.run]
         plan.blocked, plan.open = state.failed, state.open
         plans.append(plan)
+    drops.enter_into(plans, states)
     return plans
+
+
+class _DroppedUnits:
+    """The units of a plan whose results were dropped, and those of them that are computed again."""
+
+    def __init__(self, graph: Graph, store: Store) -> None:
+        self._graph = graph
+        self._store = store
+        self._dropped: dict[str, dict[str, None]] = {}  # stage to its dropped units, in order
+        self._makers: dict[str, dict[str, str]] = {}  # stage to image to the dropped unit of whose collection it is
+        self._reads: dict[tuple[str, str], list[tuple[str, str]]] = {}  # unit to the dropped units that it reads
+
+    def look(self, unit: Unit, record: UnitRecord | None, state: StageState) -> None:
+        """Take a unit of the plan into account, after those that it reads."""
+        name = unit.entry.name
+        is_dropped = record is not None and record.dropped and not all(map(self._store.blobs.exists, record.blobs()))
+        if record is not None and is_dropped:
+            self._dropped.setdefault(name, {})[unit.item] = None
+            self._makers.setdefault(name, {}).update(dict.fromkeys(record.items, unit.item))
+        if self._dropped and (is_dropped or unit.item in state.pending):
+            self._reads[name, unit.item] = list(self._dropped_inputs(unit))
+
+    def enter_into(self, plans: Sequence[StagePlan], states: Mapping[str, StageState]) -> None:
+        """Move the units that are computed again from `cached` to `run`, or to `may_run` if that is not certain."""
+        if not self._dropped:
+            return
+        found = {plan.name: plan for plan in plans}
+        again = self._followed((plan.name, item) for plan in plans for item in plan.run)
+        for (name, item), reader in again.items():
+            found[name].run[item] = f"dropped after an earlier run; {reader} reads it"
+        waiting = [plan for plan in plans if plan.open or plan.may_run]
+        may_follow = dict.fromkeys(
+            unit for plan in waiting for unit in self._inputs_of_waiting(plan, states[plan.name])
+        )
+        maybe = [unit for unit in (*may_follow, *self._followed(may_follow)) if unit not in again]
+        for name, item in dict.fromkeys(maybe):
+            found[name].may_run.append(item)
+        moved = {*again, *maybe}
+        for plan in plans:
+            in_order = dict.fromkeys((*self._dropped.get(plan.name, ()), *plan.run))
+            plan.run = {item: plan.run[item] for item in in_order if item in plan.run}
+            plan.cached = [item for item in plan.cached if (plan.name, item) not in moved]
+            plan.dropped = [item for item in self._dropped.get(plan.name, ()) if (plan.name, item) not in moved]
+
+    def _dropped_inputs(self, unit: Unit) -> Iterator[tuple[str, str]]:
+        for edge, name, _ in items_read(unit, self._graph.edges[unit.entry.name]):
+            makers = self._makers.get(edge.producer, {})
+            item = makers.get(name, WHOLE) if edge.exploded else name
+            if item in self._dropped.get(edge.producer, {}):
+                yield edge.producer, item
+
+    def _followed(self, units: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
+        """Return the dropped units that some units read, directly or through others, to a stage that reads each."""
+        found: dict[tuple[str, str], str] = {}
+        pending = deque(units)
+        while pending:
+            reader = pending.popleft()
+            for unit in self._reads.get(reader, ()):
+                if unit not in found:
+                    found[unit] = reader[0]
+                    pending.append(unit)
+        return found
+
+    def _inputs_of_waiting(self, plan: StagePlan, state: StageState) -> Iterator[tuple[str, str]]:
+        """Yield the dropped units that the units of a stage may read that wait for others."""
+        for edge in self._graph.edges[plan.name].values():
+            dropped = self._dropped.get(edge.producer, {})
+            read: Iterable[str] = dropped
+            if not plan.open and not edge.exploded:
+                match edge.port.cardinality:
+                    case Cardinality.EACH:
+                        read = plan.may_run
+                    case Cardinality.NEAR:
+                        read = (near for item in plan.may_run for near in state.near.get(item, ()))
+            yield from ((edge.producer, item) for item in read if item in dropped)
 
 
 def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:

@@ -120,6 +120,34 @@ class ReadyQueue:
         self._settle(unit.entry.name, unit.item)
         self._spread()
 
+    def block(self, unit: Unit, reason: str) -> None:
+        """Record that a unit cannot run after all."""
+        self._block(self._stages[unit.entry.name], unit.item, reason)
+        self._spread()
+
+    def settled_unit(self, stage: str, item: str) -> Unit:
+        """Return a unit, not of a source, that has a result, for computing it again."""
+        found = self._stages[stage].resolver.unit(item, self.states[stage].members[item])
+        assert isinstance(found, Unit), item
+        return found
+
+    def has_result(self, unit: Unit, record: UnitRecord) -> bool:
+        """Return whether a record holds the result with which a unit was settled."""
+        stage, state = self._stages[unit.entry.name], self.states[unit.entry.name]
+        items = stage.collections.get(unit.item, {})
+        return state.items[unit.item] == record.output and dict(items) == dict(record.items)
+
+    def maker(self, edge: Edge, name: str) -> str:
+        """Return the unit at the other end of an edge that made an item of this name."""
+        if not edge.exploded:
+            return name
+        found = self._stages[edge.producer].collections
+        return next((item for item, collection in found.items() if name in collection), WHOLE)
+
+    def is_complete(self, stage: str) -> bool:
+        """Return whether all units of a stage are settled."""
+        return stage in self._complete
+
     def producers(self, stage: str) -> set[str]:
         """Return the stages that feed a stage."""
         return {edge.producer for edge in self._stages[stage].edges.values()}

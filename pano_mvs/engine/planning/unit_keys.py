@@ -205,6 +205,7 @@ def resolve(
         names = resolver.unit_names()
         state.open = names is None
         state.failed |= resolver.blocked
+        state.near = resolver.near
         units = ((name, members, resolver.unit(name, members)) for name, members in (names or {}).items())
     for name, members, unit in units:
         state.members[name] = members

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
-from pano_mvs.engine.stages.stage import SourceItem
+from pano_mvs.engine.stages.stage import Cardinality, SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis
 
@@ -39,8 +39,11 @@ class Unit:
         return f"{self.entry.name}:{self.item}" if self.item else self.entry.name
 
     def input_blobs(self) -> Iterator[BlobRef]:
-        """Yield the blobs of all inputs."""
-        for value in self.inputs.values():
+        """Yield the blobs of all inputs that the unit loads: of a `Names` port, it only sees the names."""
+        by_name = {port.name for port in self.entry.spec.ports if port.cardinality is Cardinality.NAMES}
+        for port, value in self.inputs.items():
+            if port in by_name:
+                continue
             items = [value] if isinstance(value, ItemRef) else (value or {}).values()
             for item in items:
                 yield from item.parts.values()
@@ -58,3 +61,5 @@ class StageState:
     failed: dict[str, str] = field(default_factory=dict)  # unit to the reason why it has, or can have, no value
     pending: set[str] = field(default_factory=set)  # units that are not settled
     open: bool = False  # whether the list of units is not known yet
+    # in a plan, unit to the images whose items it reads at `Near` ports
+    near: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -8,22 +8,27 @@ changed, a further pass computes what depends on it; otherwise it is the last on
 3. Record each result: publish its files into the output folder, count it, and enter it into the ready queue, which
    releases the units that wait for it. Record each failure likewise.
 
-After the last pass the run deletes files of earlier runs that no longer belong to the results, and remembers the cache
-keys and the digests of the input files for the next run.
+A unit whose result an earlier run has dropped counts as cached, as only its digests are needed for the keys of other
+units. If a unit must be computed that reads it, it is computed again before (`pano_mvs.engine.running.dropped`).
+
+After the last pass the run deletes files of earlier runs that no longer belong to the results, remembers the cache
+keys and the digests of the input files for the next run, and drops the results of temporary stages.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from pano_mvs.core.errors import ContractError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.dropping import drop_results, drop_unneeded
 from pano_mvs.engine.cache.maintenance import pack
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import Sample
@@ -36,6 +41,7 @@ from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.unit_keys import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
+from pano_mvs.engine.running.dropped import DroppedResults
 from pano_mvs.engine.running.events import Observer, RunResult, UnitFailed, Warned, ignore
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
@@ -97,6 +103,9 @@ class Run:
         self._has_passed = False  # whether the last pass ended without an error
         self._warnings: list[str] = []
         self._last_keys = store.runs.last_keys(workflow.id) if options.accept_code else {}
+        # stages whose results the run may drop, each with those that read it
+        self.temporary = options.temporary_stages(self.workflow, self.graph)
+        self.is_alone: Callable[[], bool] = lambda: False  # whether no other run uses the cache, during `execute`
         self._pass = RunPass(self, self._warnings)
 
     @property
@@ -128,6 +137,11 @@ class Run:
                 f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
                 "Use --executor processes"
             )
+        with self.store.in_use() as self.is_alone:
+            return self._executed()
+
+    def _executed(self) -> RunResult:
+        """Run every stage, while the cache is marked as in use."""
         try:
             self._execute_passes()
             self._has_passed = True
@@ -173,8 +187,14 @@ class Run:
             if unit.key not in self.computed:
                 return None
         last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
-        record = self._planned.pop(unit.key, None) or self.store.find(unit.key)
-        return record or self.options.accepted(unit, last, self.store)
+        may_drop = unit.entry.name in self.temporary
+        record = self._planned.pop(unit.key, None) or self.store.find(unit.key, or_dropped=may_drop)
+        record = record or self.options.accepted(unit, last, self.store, or_dropped=may_drop)
+        if record is not None and record.dropped and not may_drop:  # its blobs exist all the same: keep them
+            record = replace(record, dropped=False)
+            with suppress(StoreError):  # a cache of other users can be read, not written
+                self.store.replace([record])
+        return record
 
     def note_planned(self, unit: Unit, record: UnitRecord | None) -> None:
         """Keep a record that the forecast has found for `find_record`, so that it is read and checked once."""
@@ -210,14 +230,27 @@ class Run:
     def _remember(self) -> None:
         """Store keys, file digests and times for the next run; the run does not fail if that is impossible."""
         finished = self._has_passed and not self.result.stopped and not self.graph.is_part
+        unneeded = self._pass.stored.unneeded_stages() if finished else ()
         try:
             self.store.runs.remember(
-                self.workflow.id, self.keys, workflow=self.workflow.name, out=self.out, finished=finished
+                self.workflow.id,
+                self.keys,
+                workflow=self.workflow.name,
+                out=self.out,
+                finished=finished,
+                temporary=unneeded,
             )
             self.store.stat_cache.save()
             self._remember_times()
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
+        if unneeded and self._pass.stored.has_undropped:
+            if not self.is_alone():
+                return  # the run that ends last drops and packs
+            try:
+                drop_unneeded(self.store)
+            except StoreError as error:
+                self.warn(f"the results of temporary stages stay in the cache: {error}")
         if self._has_passed and self.computed:
             try:
                 pack(self.store)
@@ -261,6 +294,7 @@ class RunPass:
         # the units that can run, and the results so far
         self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
         self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
+        self.stored = DroppedResults(run.temporary, run.graph, run.store, queue=self.queue)
 
     def execute(self) -> None:
         """Settle every unit, and enter into the result how it ended.
@@ -280,6 +314,7 @@ class RunPass:
         except RunStoppedError as error:
             stop = error
         finally:
+            self._statistics.end_pass()
             self._statistics.put_in_order(
                 self.queue.position_of, replaced=self._replaced(), superseded=self._superseded()
             )
@@ -301,10 +336,10 @@ class RunPass:
         while True:
             none_ready = False
             if held is None and dispatcher.has_capacity:
-                unit = self.queue.next_unit()
+                unit = self.stored.next_unit() or self.queue.next_unit()
                 none_ready = unit is None
                 held = unit if unit is not None and not self._take_from_cache(unit) else None
-            if held is not None and self._dispatch(held):
+            if held is not None and (self._waits(held) or self._dispatch(held)):
                 held = None
             if none_ready and not dispatcher:
                 if self.damaged:
@@ -322,6 +357,11 @@ class RunPass:
         if unit.key in self._duplicates:
             self._duplicates[unit.key].append(unit)
             return True
+        if self.stored.is_again(unit):
+            again = self._store.find(unit.key)
+            if again is not None:
+                self._restored(unit, again)
+            return again is not None
         self._run.keys.setdefault(unit.entry.name, {})[unit.item] = unit.key
         known = len(self._store.damaged)
         record = self._run.find_record(unit)
@@ -358,13 +398,7 @@ class RunPass:
         outcome, unit = finished.outcome, finished.unit
         duplicates = self._duplicates.pop(unit.key)
         if outcome.status == "damaged":
-            # The incomplete records that led to a damaged file are dropped, so that they are computed again.
-            for producer in self.queue.producers(unit.entry.name):
-                for key in self._run.keys.get(producer, {}).values():
-                    record = self._store.read_record(key)
-                    if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
-                        self._store.drop(key)
-            self.damaged.append(outcome.cause)
+            self.damaged.append(self._cause_of_damage(unit) or outcome.cause)
             return
         if outcome.status == "changed" and self._run.listing.report(outcome.changed):
             self.damaged.append(outcome.cause)
@@ -380,12 +414,69 @@ class RunPass:
             if not self._take_from_cache(duplicate):
                 self._fail(FinishedJob(duplicate, outcome, finished.log, finished.said))
 
+    def _cause_of_damage(self, unit: Unit) -> str:
+        """Remove the incomplete records that led to a damaged file, so that they are computed again.
+
+        Returns:
+            What happened if nothing is damaged: another run has dropped results. Otherwise nothing.
+        """
+        is_damaged, was_dropped = False, False
+        for producer in self.queue.producers(unit.entry.name):
+            for key in self._run.keys.get(producer, {}).values():
+                record = self._store.read_record(key)
+                if record is None or all(map(self._store.blobs.exists, record.blobs())):
+                    continue
+                if record.dropped:
+                    was_dropped = True
+                else:
+                    self._store.drop(key)
+                    is_damaged = True
+        if is_damaged or not was_dropped:
+            return ""
+        return f"another run has dropped what {unit.label} reads; computing it again"
+
     def _record(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
         """Publish a result, count it, and enter it into the queue."""
+        if self.stored.is_again(unit):
+            self._statistics.unit_computed_again(unit.entry, unit.item, record)
+            self._restored(unit, record)
+            return
         if issubclass(unit.entry.spec.output, Files) and not self._publish(unit, record):
             return
         self._statistics.unit_done(unit.entry, unit.item, record, status="run" if was_computed else "cached")
+        self.stored.settled(unit, record)
         self.queue.finish(unit, record)
+        self._drop_early()
+
+    def _waits(self, unit: Unit) -> bool:
+        """Return whether a unit cannot be computed now, because results that it reads were dropped."""
+        if cause := self.stored.failed_input(unit):
+            self._block(self.stored.failed(unit) if self.stored.is_again(unit) else [unit], cause)
+            return True
+        return self.stored.wait(unit)
+
+    def _restored(self, unit: Unit, record: UnitRecord) -> None:
+        """Go on with the units that waited for a result that had been dropped and is back."""
+        if not self.stored.restored(unit, record):
+            self.damaged.append(
+                f"{unit.label} has another result than the one that was dropped; what reads it is computed again"
+            )
+
+    def _block(self, units: Iterable[Unit], cause: str) -> None:
+        for unit in units:
+            self.queue.block(unit, f"needs {cause}, which failed")
+
+    def _drop_early(self) -> None:
+        """Drop results that no unit of the run reads any more, if they take much space."""
+        run = self._run
+        if self.damaged or run.graph.is_part or not self.stored.takes_much or not run.is_alone():
+            return
+        stages = self.stored.take_unneeded()
+        others = {key for name, keys in run.keys.items() if name not in stages for key in keys.values()}
+        try:
+            drop_results(self._store, (key for name in stages for key in run.keys[name].values()), needed=others)
+        except StoreError as error:
+            run.warn(f"the results of temporary stages stay in the cache: {error}")
 
     def _publish(self, unit: Unit, record: UnitRecord) -> bool:
         """Write a unit's files into the output folder; return whether that was possible."""
@@ -414,12 +505,17 @@ class RunPass:
             finished.said,
             outcome.trace,
         )
-        self._statistics.unit_failed(failure, outcome.seconds)
+        was_cached = self.stored.is_again(unit)
+        self.stored.note_failed(unit)
+        self._statistics.unit_failed(failure, outcome.seconds, was_cached=was_cached)
         if outcome.exit_code and self.queue.states[entry.name].axis is Axis.ONE:
             raise UnusableInputError(f"{entry.name}: {outcome.cause}", outcome.exit_code)
         if entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
-        self.queue.fail(unit, outcome.cause)
+        if was_cached:
+            self._block(self.stored.failed(unit), unit.label)
+        else:
+            self.queue.fail(unit, outcome.cause)
 
     def _replaced(self) -> set[str]:
         """Return the stages whose results a finished later stage reads and replaces by its own, of the same kind."""

@@ -53,6 +53,7 @@ class RunStatistics:
         self._running: dict[str, set[str]] = {}  # stage to its units that are being computed
         self._began: dict[str, float] = {}  # stage to the time since when there are any
         self._source_notes: dict[str, Mapping[str, tuple[str, ...]]] = {}
+        self._again: set[str] = set()  # stages with units that were computed again
 
     def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
         """Pass on the names of the images, and keep the notes on each."""
@@ -113,9 +114,30 @@ class RunStatistics:
         seconds = round(record.seconds, 6) if status == "run" else 0.0
         self._observer(UnitFinished(entry.name, item, status, seconds))
 
-    def unit_failed(self, failure: UnitFailed, seconds: float) -> None:
-        """Count a unit without a result."""
-        self._stop_clock(failure.stage, failure.item).failed += 1
+    def unit_computed_again(self, entry: StageEntry, item: str, record: UnitRecord) -> None:
+        """Count a unit as computed that counted as cached, because its result had been dropped."""
+        summary = self._summaries[entry.name]
+        summary.cached -= 1
+        self._again.add(entry.name)
+        for found in (summary.unit_metrics, summary.unit_notes, summary.rejected, summary.doubts):
+            found.pop(item, None)
+        self.unit_done(entry, item, record, status="run")
+
+    def end_pass(self) -> None:
+        """Notify the observer of the stages with units that were computed again after the stage had finished."""
+        for name in sorted(self._again):
+            self._observer(self._summaries[name].event())
+        self._again.clear()
+
+    def unit_failed(self, failure: UnitFailed, seconds: float, *, was_cached: bool = False) -> None:
+        """Count a unit without a result.
+
+        Args:
+            was_cached: whether it counted as cached, because its result had been dropped.
+        """
+        summary = self._stop_clock(failure.stage, failure.item)
+        summary.cached -= was_cached
+        summary.failed += 1
         self._result.failures.append(failure)
         self._observer(failure)
         self._observer(UnitFinished(failure.stage, failure.item, "failed", round(seconds, 6)))

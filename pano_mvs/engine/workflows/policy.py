@@ -89,6 +89,11 @@ class Policy(BaseModel):
     optional: bool = Field(
         default=False, description="whether the stage is left out, with a warning, if no plugin offers it"
     )
+    temporary: bool = Field(
+        default=False,
+        description="whether a run drops the results from the cache once all stages that read them are done; they are "
+        "computed again when something reads them. The last results of a kind, and files, are always kept",
+    )
     to: str = Field(default="", description="folder for the stage's files, inside the output folder")
 
     @property

@@ -21,6 +21,7 @@ from pano_mvs.core.files import OUTPUT_MARK, make_folder, write_text
 from pano_mvs.core.paths import children, exists, is_file, is_folder, reason_of, resolved
 from pano_mvs.core.text import shortened_list
 from pano_mvs.core.yaml_text import did_you_mean
+from pano_mvs.engine.cache.dropping import dropping_after
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import executor_size
 from pano_mvs.engine.running.events import ignore
@@ -439,7 +440,8 @@ def run_experiment(
     out = experiment.request.out
     done = [_not_run(run) for run in experiment.runs]
     make_folder(out)
-    with output_lock(out):
+    roots = [run.session.store_root for run in experiment.runs]
+    with output_lock(out), dropping_after(roots):  # they share units
         write_text(out / OUTPUT_MARK, "")
         Origin("vary").write(out)
         _write(variation_of(experiment, done))

@@ -39,6 +39,7 @@ from pano_mvs.session.progress import Event, RunFinished
 from tests.cli.conftest import Command, Outcome
 from tests.docs.pages import block, text_of
 from tests.engine.conftest import PATIENCE_S, Toy, finished_records, heed_interrupts
+from tests.engine.rows import KEPT, Rows
 
 
 def vary(pano_mvs: Command, toy: Toy, *options: str | os.PathLike[str]) -> Outcome:
@@ -77,6 +78,19 @@ def test_a_grid_of_12_computes_each_distinct_unit_once(toy: Toy, pano_mvs: Comma
         assert (toy.folder / "v" / "capture" / name / "all.txt").is_file()
     texts = {(toy.folder / "v" / "capture" / name / "all.txt").read_bytes() for name in names}
     assert len(texts) == 12
+
+
+def test_runs_share_what_is_temporary_and_drop_it_when_all_have_ended(tmp_path: Path, pano_mvs: Command) -> None:
+    rows = Rows(tmp_path)
+    own = ("--out", tmp_path / "v", "--cache", tmp_path / "cache", "--executor", "serial")
+    done = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,8")
+    assert done.code == 0, done.text
+    found = json.loads((tmp_path / "v" / "vary.json").read_text())
+    assert computed(found) == [25, 8, 8]
+    outs = [f"v/capture/value={value}" for value in (5, 6, 8)]
+    assert [rows.kept(of=out) for out in outs] == [KEPT] * 3
+    again = pano_mvs("vary", tmp_path / "wf.yaml", *own, "--set", "last.value=5,6,8")
+    assert computed(json.loads((tmp_path / "v" / "vary.json").read_text())) == [0, 0, 0], again.text
 
 
 def test_the_same_command_resumes(toy: Toy, pano_mvs: Command) -> None:

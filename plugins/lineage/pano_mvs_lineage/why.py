@@ -16,6 +16,7 @@ from pano_mvs.core.file_names import is_of_the_run
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.dropping import dropping_after
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.running.publish import delivered_files
 from pano_mvs.results.origin import ORIGIN, Origin, RunName
@@ -162,7 +163,7 @@ def repeat(origin: FileOrigin, *, cache: str | Path | None = None) -> Repeated:
     unit = origin.units[0]
     session = reopen(str(origin.out), overrides=[], images=None, cache=None if cache is None else Path(cache))
     before = StoredRun.open(origin.out, session.store_root).record(unit.stage, unit.item)
-    with TemporaryDirectory(prefix="pano-mvs-why-") as folder:
+    with TemporaryDirectory(prefix="pano-mvs-why-") as folder, dropping_after([session.store_root]):
         out, options = Path(folder) / "out", RunOptions(only=(unit.label,), refresh=(unit.label,))
         try:
             output = run_session(replace(session, out=out, run_options=options), Execution(executor="serial"))

@@ -1,9 +1,10 @@
 """Copy a cache to or from another place: a folder, SSH, or an object store, by fsspec.
 
 Files of a cache are never changed, and their names state what they hold, so that a file of the same size is not copied
-again, and an interrupted copy goes on with the same command. What is copied is checked against its digests first:
-blobs and packs by what they hold, records and lists of runs by the digest in their first line. Values are copied before
-the records and the indexes that name them, so that a copy is a valid cache at any time.
+again, and an interrupted copy goes on with the same command. Only records grow when their results are dropped. What is
+copied is checked against its digests first: blobs and packs by what they hold, records and lists of runs by the digest
+in their first line. Values are copied before the records and the indexes that name them, so that a copy is a valid
+cache at any time.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pano_mvs.core.files import CACHE_MARK, checked_body, read_regular, remove_w
 from pano_mvs.core.paths import below, is_file, is_link
 from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, refuse_link
 from pano_mvs.engine.cache.packs import RECORD, values_of
-from pano_mvs.engine.cache.store import Store, is_intact
+from pano_mvs.engine.cache.store import LAYOUT_VERSION, READ_LAYOUTS, Store, is_intact
 
 Progress = Callable[[int, int], None]  # called with the bytes that are copied so far, and all bytes to copy
 _AT_A_TIME = 8
@@ -81,8 +82,8 @@ class RemoteCache:
                 raise UsageError(f"{self.url} holds files but no cache: choose an empty place")
             self._attempt(lambda: self._write(CACHE_MARK, b""))
             self._attempt(lambda: self._write("layout.json", (store.root / "layout.json").read_bytes()))
-        else:
-            self._require_layout(layout, store)
+        elif self._checked_layout(layout, store) < LAYOUT_VERSION:
+            self._attempt(lambda: self._write("layout.json", (store.root / "layout.json").read_bytes()))
         local = _local_files(store)
 
         def copy(name: str) -> None:
@@ -107,7 +108,8 @@ class RemoteCache:
         layout = self._layout()
         if layout is None:
             raise UsageError(f"{self.url} is not a cache: pano-mvs cache push makes one")
-        self._require_layout(layout, store)
+        if self._checked_layout(layout, store) == LAYOUT_VERSION:
+            store.mark_layout()
 
         def copy(name: str) -> None:
             path = store.root / name
@@ -169,10 +171,13 @@ class RemoteCache:
         except ValueError as error:
             raise StoreError(f"{self.url}: layout.json is damaged. Delete it, and push again") from error
 
-    def _require_layout(self, layout: object, store: Store) -> None:
-        own = json.loads(read_regular(store.root / "layout.json"))
-        if layout != own:
+    def _checked_layout(self, layout: object, store: Store) -> int:
+        """Return the layout of the remote cache, which a cache of this version can hold; raise UsageError otherwise."""
+        version = layout.get("layout") if isinstance(layout, dict) else None
+        if type(version) is not int or version not in READ_LAYOUTS:
+            own = json.loads(read_regular(store.root / "layout.json"))
             raise UsageError(f"{self.url} has layout {layout!r}, but {store.root} has {own!r}: choose another place")
+        return version
 
     def _attempt(self, action: Callable[[], Any]) -> Any:
         """Return the result of an action; libraries of object stores raise errors of many kinds."""

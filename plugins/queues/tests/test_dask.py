@@ -19,8 +19,10 @@ from pano_mvs_queues.dask_cluster import DaskExecutor
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import SerialExecutor
+from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.stage_code import code_texts, stage_code
 from tests.engine.conftest import Toy, ran
+from tests.engine.rows import KEPT, Rows
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
 from tests.engine.running.test_run import ALL_UNITS
 
@@ -93,6 +95,20 @@ def test_local_cluster_gives_the_bytes_of_serial(toy: Toy) -> None:
     assert not list((toy.folder / "cache-dask" / "tmp").iterdir())
 
 
+def test_temporary_results_are_dropped_and_computed_again(tmp_path: Path) -> None:
+    rows = Rows(tmp_path)
+    store = rows.store
+    for overrides, expected in (((), 25), (("last.value=6",), 20), (("last.value=6",), 0)):
+        session = rows.session(*overrides)
+        executor = DaskExecutor(store, workers=2, threads=1)
+        try:
+            result = Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
+        finally:
+            executor.close()
+        assert (result.exit_code, result.computed, result.warnings) == (0, expected, [])
+        assert rows.kept() == KEPT
+
+
 def test_existing_cluster_gives_the_bytes_of_serial_and_lives_on(toy: Toy) -> None:
     serial = run_with(toy, SerialExecutor, name="serial")
     with existing_cluster(toy.folder / "cluster") as (address, workers):
@@ -114,8 +130,6 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
     store = Store(toy.folder / "cache")
     executor = DaskExecutor(store, workers=1, threads=1)
     try:
-        from pano_mvs.engine.running.run import Run
-
         result = Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()
     finally:
         executor.close()

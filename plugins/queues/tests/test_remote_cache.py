@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -17,8 +18,11 @@ from pano_mvs.cli.app import app
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.engine.cache import maintenance
 from pano_mvs.engine.cache.maintenance import pack, verify
-from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.store import LAYOUT_VERSION, Store
+from pano_mvs.engine.planning.plan import RunOptions
+from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, toy_in
+from tests.engine.rows import Rows
 from tests.engine.running.test_run import ALL_UNITS
 
 UNITS = sum(ALL_UNITS.values())
@@ -193,3 +197,24 @@ def test_the_commands_say_what_they_copied(computed: Store, place: Path, tmp_pat
     assert "0 files, 0 B;" in call("push", str(place), "--cache", str(computed.root))
     call("pull", str(place), "--cache", str(tmp_path / "other"))
     assert is_whole(tmp_path / "other")
+
+
+def test_a_place_of_the_layout_before_gets_compressed_and_dropped_results(tmp_path: Path, place: Path) -> None:
+    rows = Rows(tmp_path)
+    rows.run(options=RunOptions(keep_all=True))
+    (tmp_path / "cache" / "layout.json").write_text('{"layout": 2}')
+    remote = RemoteCache(str(place))
+    remote.push(rows.store)
+    assert json.loads((place / "layout.json").read_text()) == {"layout": 2}
+    rows.store.mark_layout()
+    rows.run()
+    remote.push(rows.store)
+    assert json.loads((place / "layout.json").read_text()) == {"layout": LAYOUT_VERSION}
+    fresh = tmp_path / "fresh"
+    Store(fresh)
+    (fresh / "layout.json").write_text('{"layout": 2}')
+    remote.pull(Store(fresh))
+    assert json.loads((fresh / "layout.json").read_text()) == {"layout": LAYOUT_VERSION}
+    session = rows.session("last.value=6")
+    result = Run(session.workflow, session.graph, Store(fresh), out=session.out).execute()
+    assert (result.exit_code, result.warnings) == (0, [])

@@ -505,7 +505,7 @@ def test_json_that_is_no_object_is_damage(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ['{"layout": true}', '{"layout": 1}', '{"layout": "2"}', "[2]", "{}"])
 def test_a_cache_of_an_unknown_layout_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "layout.json").write_text(text)
-    with pytest.raises(UsageError, match=r"has layout .*, but this version uses 2\. Choose another cache with --cache"):
+    with pytest.raises(UsageError, match=r"has layout .*, but this version uses 3\. Choose another cache with --cache"):
         Store(tmp_path)
 
 
