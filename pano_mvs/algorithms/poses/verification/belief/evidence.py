@@ -88,7 +88,7 @@ def camera_evidence(
 
 
 def _certain(model: PlacedModel) -> set[int]:
-    """Return the cameras with a pair that is no chance, whether or not it agrees with them."""
+    """Return the cameras with a pair that chance does not explain, whether or not it agrees with them."""
     return {
         image
         for edge, view in (model.pairs.compared or {}).items()
