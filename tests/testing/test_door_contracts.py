@@ -30,7 +30,10 @@ from pano_mvs.testing.conformance import (
 )
 from pano_mvs.testing.observer_contract import runs_of
 
-KEPT = [*executor_contract_tests("serial"), *executor_contract_tests("processes")]
+KEPT = [
+    *executor_contract_tests("serial"),
+    *(pytest.param(one, marks=pytest.mark.slow) for one in executor_contract_tests("processes")),
+]
 
 
 @pytest.mark.parametrize("contract_test", KEPT, ids=str)

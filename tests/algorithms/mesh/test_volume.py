@@ -131,7 +131,7 @@ def test_planes_continue_behind_a_board_and_not_beyond_the_walls() -> None:
 
 def board_seen_from(*centers: tuple[float, float, float]) -> list[tuple[RangeMap, Rigid3]]:
     """Range maps of a square board without thickness in the plane z = 0, before walls at a distance of 4."""
-    rays, maps = ray_grid((128, 256)), []
+    rays, maps = ray_grid((64, 128)), []
     for center in np.array(centers):
         with np.errstate(divide="ignore", invalid="ignore"):
             ranges = np.where(rays[..., 2] * center[2] < 0, -center[2] / rays[..., 2], np.inf)

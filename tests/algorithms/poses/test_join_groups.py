@@ -155,7 +155,7 @@ def _errors(poses: Poses, truth: dict[str, Rigid3]) -> tuple[float, float]:
     return max(angles), float(np.linalg.norm(scale * own - other, axis=1).max())
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_rooms_are_joined_by_the_matches_of_all_their_pairs(turned: bool) -> None:
     truth = room_poses(turned=turned)
     features = room_features(truth, door=8, false=60)

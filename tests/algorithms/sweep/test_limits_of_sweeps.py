@@ -101,9 +101,17 @@ def mean_baseline(poses: Sequence[Rigid3]) -> float:
     return float(np.mean([np.linalg.norm(pose.center - poses[0].center) for pose in poses[1:]]))
 
 
-def test_limits_hold_what_there_is_without_wasting_planes(capture: Capture) -> None:
-    pictures, poses, truth = capture
-    near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+@pytest.fixture(scope="module")
+def capture_limits(capture: Capture) -> tuple[float, float]:
+    pictures, poses, _ = capture
+    return limits_by_sweeping(pictures, poses, masks=no_masks(4))
+
+
+def test_limits_hold_what_there_is_without_wasting_planes(
+    capture: Capture, capture_limits: tuple[float, float]
+) -> None:
+    _, poses, truth = capture
+    near, far = capture_limits
     nearest, farthest = np.nanquantile(truth[0], [0.01, 0.99])
     assert min(nearest / 3, 0.4 * mean_baseline(poses)) < near < nearest
     assert farthest < far < 3 * farthest
@@ -119,10 +127,11 @@ def test_the_near_limit_reaches_a_desk_within_the_baseline(top: Texture) -> None
     assert 0.4 * nearest < near < nearest
 
 
-def test_something_near_is_possible_where_nothing_near_agrees(capture: Capture) -> None:
+def test_something_near_is_possible_where_nothing_near_agrees(
+    capture: Capture, capture_limits: tuple[float, float]
+) -> None:
     """A surface without texture, which no small sweep finds, may still be as near as half a baseline."""
-    pictures, poses, _ = capture
-    assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.5 * mean_baseline(poses)
+    assert capture_limits[0] <= 0.5 * mean_baseline(capture[1])
 
 
 @pytest.fixture(scope="module")
@@ -164,22 +173,22 @@ def test_the_near_limit_stays_where_lower_ones_do_not_help(table: Capture, monke
     assert tried[-1] == pytest.approx(near / 4)
 
 
-def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
+def test_limits_follow_the_unit_of_length(capture: Capture, capture_limits: tuple[float, float]) -> None:
     pictures, poses, _ = capture
     longer = [Rigid3(pose.rotation, 4 * pose.translation) for pose in poses]
-    near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+    near, far = capture_limits
     assert limits_by_sweeping(pictures, longer, masks=no_masks(4)) == pytest.approx((4 * near, 4 * far))
 
 
-def test_rolling_all_pictures_changes_nothing(capture: Capture) -> None:
+def test_rolling_all_pictures_changes_nothing(capture: Capture, capture_limits: tuple[float, float]) -> None:
     pictures, poses, _ = capture
     rolled = [roll_panorama(picture, 48) for picture in pictures]
     turned = [
         Rigid3(new_from_old @ pose.rotation, new_from_old @ pose.translation)
         for (_, new_from_old), pose in zip(rolled, poses, strict=True)
     ]
-    expected = limits_by_sweeping(pictures, poses, masks=no_masks(4))
-    assert limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4)) == expected
+    found = limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4))
+    assert found == capture_limits
 
 
 def test_pictures_that_agree_on_nothing_get_the_limits_of_the_cameras(capture: Capture) -> None:
