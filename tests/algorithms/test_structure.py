@@ -217,7 +217,9 @@ def _noisy_box(noise: float, darker: float | None) -> Box:
     return box
 
 
-@pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
+@pytest.mark.parametrize(
+    ("grey", "count"), [pytest.param(True, 0, marks=pytest.mark.slow), (False, 1)], ids=["one grey", "clear creases"]
+)
 def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, count: int) -> None:
     box = Box()
     for name, center in zip(box.maps, CENTERS, strict=True):
@@ -227,6 +229,7 @@ def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, co
     assert len(supposed_ceiling(views, planes[:1])) == count
 
 
+@pytest.mark.slow
 def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     """Its ranges are 20 % too large, so that creases are clearest at the lowest height that is searched."""
     box = Box()
@@ -237,6 +240,7 @@ def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     assert moved_ceilings(views, [floor, ceiling])[1] == ceiling
 
 
+@pytest.mark.slow
 def test_a_camera_above_a_tried_ceiling_has_no_creases_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A crease below the camera would be taken for one with the floor."""
     box, downs = Box(), []

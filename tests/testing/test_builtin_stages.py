@@ -46,7 +46,14 @@ INPUTS: dict[str, dict[str, Any]] = {
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
 # They run neural networks, render or start a process, half a second or more at each call.
-SLOW = ("export.mesh", "export.mesh_textured", "features.aliked", "masks.operator", "poses.localise")
+SLOW = (
+    "export.floor_plan",
+    "export.mesh",
+    "export.mesh_textured",
+    "features.aliked",
+    "masks.operator",
+    "poses.localise",
+)
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 

@@ -249,6 +249,7 @@ def test_commands_that_break_their_contract_are_found(mine: Path, given: dict[st
     assert broken([one for one in command_contract_tests(mine / "mine.py") if one.name.endswith(test)]) == {}
 
 
+@pytest.mark.slow
 def test_commands_that_load_large_libraries_for_their_help_are_found(mine: Path) -> None:
     text = COMMAND.format(name="mine", parameter=NAMED, doc="Be mine.", body="print(name)")
     (mine / "mine.py").write_text(text)

@@ -300,6 +300,7 @@ def test_a_capture_that_cannot_be_read_is_in_the_table(toy: Toy, captures: list[
     assert "(2 of 3)" in done.flat
 
 
+@pytest.mark.slow
 def test_an_interrupted_experiment_resumes(toy: Toy, pano_mvs: Command) -> None:
     words = [sys.executable, "-m", "pano_mvs", "vary", str(toy.folder / "wf.yaml"), "--set", "scaled.by=2,3,4"]
     words += ["--out", str(toy.folder / "v"), "--cache", str(toy.folder / "cache"), "--executor", "serial"]

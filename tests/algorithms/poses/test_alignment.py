@@ -304,6 +304,7 @@ def test_a_bundle_refuses_impossible_sigmas(sigmas: NDArray[Any]) -> None:
         replace(bundle, sigmas=sigmas).check()
 
 
+@pytest.mark.slow
 def test_groups_are_aligned_one_by_one(room: Room) -> None:
     poses, pictures = room
     others = {f"b{name}": picture for name, picture in pictures.items()}

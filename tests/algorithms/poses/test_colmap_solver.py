@@ -225,7 +225,10 @@ def pictures() -> list[tuple[str, np.ndarray, np.ndarray]]:
     valid = np.ones((240, 480), np.bool_)
     valid[120:, :200] = False
     poses = capture_poses(3, spread=0.4)
-    return [(f"b/{n} ä.png", render(default_room(), pose, (240, 480))[0], valid) for n, pose in enumerate(poses)]
+    return [
+        (f"b/{n} ä.png", render(default_room(), pose, (240, 480), supersample=1)[0], valid)
+        for n, pose in enumerate(poses)
+    ]
 
 
 @pytest.mark.slow

@@ -90,6 +90,7 @@ def pairs_without_common_points() -> tuple[dict[str, Features], dict[tuple[str, 
     return features, views
 
 
+@pytest.mark.slow
 def test_small_range_maps_give_the_lengths_that_no_third_image_does() -> None:
     features, views = pairs_without_common_points()
     pairs = pairs_of(features, {pair: view for pair, view in views.items() if "0.png" in pair})  # no rays to intersect

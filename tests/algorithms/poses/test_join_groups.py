@@ -191,6 +191,7 @@ def test_unrelated_places_stay_two_groups() -> None:
     assert len(poses.worlds) == 2
 
 
+@pytest.mark.slow
 def test_rooms_that_fit_in_two_places_stay_two_groups() -> None:
     """Every point behind the door is seen twice: where it is, and where an equal room would have it."""
     truth = room_poses(turned=True)

@@ -52,6 +52,7 @@ def test_a_walk_is_registered_whole_and_does_not_drift(count: int) -> None:
     assert drift(poses, capture) < 0.002
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_many_draws() -> None:
     """Errors of centres and rotations, divided by their standard deviations, have a mean square of one."""
     centers, rotations = [], []

@@ -89,7 +89,7 @@ SIZE_HW = (96, 192)
 @pytest.fixture(scope="module")
 def capture() -> Capture:
     poses = capture_poses(4, spread=0.4)
-    views = [render(default_room(), pose, SIZE_HW) for pose in poses]
+    views = [render(default_room(), pose, SIZE_HW, supersample=1) for pose in poses]
     return [image for image, _ in views], poses, [truth for _, truth in views]
 
 
@@ -212,7 +212,7 @@ YARD_HW = 96, 192
 @pytest.fixture(scope="module")
 def outdoors() -> tuple[list[NDArray[np.uint8]], tuple[Rigid3, ...], NDArray[np.float32]]:
     scene = courtyard(seed=3, views=3)
-    views = [scene.view(idx, YARD_HW) for idx in range(3)]
+    views = [scene.view(idx, YARD_HW, supersample=1) for idx in range(3)]
     return [picture for picture, _ in views], scene.poses, views[0][1]
 
 
@@ -240,6 +240,7 @@ def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(
     assert far > np.nanmax(truth)
 
 
+@pytest.mark.slow
 def test_the_sky_is_invalid_and_the_court_is_not(
     outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
 ) -> None:
@@ -258,7 +259,7 @@ def test_the_sky_is_invalid_and_the_court_is_not(
 
 def test_no_wall_is_lost_indoors() -> None:
     poses = capture_poses(3, seed=2)
-    views = [render(default_room(2, "weak"), pose, YARD_HW) for pose in poses]
+    views = [render(default_room(2, "weak"), pose, YARD_HW, supersample=1) for pose in poses]
     pictures = [picture for picture, _ in views]
     found = swept_between(pictures, poses, (0.5, 8.0))
     assert found.valid.mean() > 0.999

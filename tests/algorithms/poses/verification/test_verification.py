@@ -227,6 +227,7 @@ def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
     assert np.isnan(found.confirmed_shares).all()
 
 
+@pytest.mark.slow
 def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
     model = model_of(displaced("2.png"), matches)
     before = dict(model.cameras)
