@@ -121,6 +121,7 @@ def test_an_image_whose_places_nothing_confirms_is_left_out_with_the_reason() ->
     assert "confirm nothing" in refused[4]
 
 
+@pytest.mark.slow
 def test_pictures_without_texture_leave_the_decision_to_the_pairs() -> None:
     features, views = room_matches({4: AWAY})
     pairs = pairs_of(features, views)

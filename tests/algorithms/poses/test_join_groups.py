@@ -412,6 +412,7 @@ def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
     assert height_above_floor(_models(room_features(truth, door=0, own=10), truth, unit=1.0)[0]) == 0
 
 
+@pytest.mark.slow
 def test_no_model_is_lost_where_joined_ones_share_no_pair() -> None:
     """Two pairs of rooms, between which no images were compared."""
     truth = room_poses()

@@ -155,6 +155,7 @@ def test_the_near_limit_reaches_a_plain_table_nearer_than_all_textured_surfaces(
     assert same_far == far
 
 
+@pytest.mark.slow
 def test_the_near_limit_stays_where_lower_ones_do_not_help(table: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Plain pixels that end in the nearest planes of every sweep are there by chance."""
     pictures, poses, _ = table
