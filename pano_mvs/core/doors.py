@@ -188,7 +188,7 @@ def is_bundled(entry: EntryPoint) -> bool:
 
 @lru_cache(maxsize=1024)
 def _name_and_version(dist: Distribution) -> tuple[str, str]:
-    """Return the name and the version of a distribution; each of the two would parse the whole metadata anew."""
+    """Return the name and the version of a distribution; each of the two would parse the whole metadata again."""
     metadata = dist.metadata
     return metadata["Name"], metadata["Version"]
 

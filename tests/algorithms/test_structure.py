@@ -180,7 +180,7 @@ def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
 @pytest.mark.parametrize(
     ("darker", "noise"),
     [
-        (0.0, 3.0),
+        pytest.param(0.0, 3.0, marks=pytest.mark.slow),
         (10.0, 0.0),
         pytest.param(0.0, 0.0, marks=pytest.mark.slow),
         pytest.param(10.0, 3.0, marks=pytest.mark.slow),

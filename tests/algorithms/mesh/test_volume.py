@@ -129,17 +129,14 @@ def test_planes_continue_behind_a_board_and_not_beyond_the_walls() -> None:
     assert (np.abs(volume.surface()[0]) < HALF + 3 * volume.cell).all()
 
 
-WALLS_AT = 2.5
-
-
 def board_seen_from(*centers: tuple[float, float, float]) -> list[tuple[RangeMap, Rigid3]]:
-    """Range maps of a square board without thickness in the plane z = 0, before walls at a distance of `WALLS_AT`."""
+    """Range maps of a square board without thickness in the plane z = 0, before walls at a distance of 4."""
     rays, maps = ray_grid((128, 256)), []
     for center in np.array(centers):
         with np.errstate(divide="ignore", invalid="ignore"):
             ranges = np.where(rays[..., 2] * center[2] < 0, -center[2] / rays[..., 2], np.inf)
             hit = (np.abs(center + ranges[..., None] * rays)[..., :2] < 0.5).all(axis=-1)
-        found = np.where(hit, ranges, WALLS_AT).astype(np.float32)
+        found = np.where(hit, ranges, 4.0).astype(np.float32)
         pose = Rigid3.from_center(np.eye(3), center)
         maps.append((RangeMap(found, np.full(found.shape, 200, np.uint8)), pose))
     return maps
@@ -157,6 +154,7 @@ def area_near_board(maps: list[tuple[RangeMap, Rigid3]]) -> float:
     return float(areas[near].sum())
 
 
+@pytest.mark.slow
 def test_a_thin_board_that_is_seen_from_both_sides_remains() -> None:
     """Both sides once cancelled each other, and smoothing removed what was left."""
     both = board_seen_from((0, 0, -1.5), (0.2, 0, 1.5), (-0.2, 0.1, -1.4), (0, -0.1, 1.6))
@@ -164,9 +162,10 @@ def test_a_thin_board_that_is_seen_from_both_sides_remains() -> None:
     assert area_near_board(both[::2]) > 0.7
 
 
+@pytest.mark.slow
 def test_a_surface_is_removed_where_more_panoramas_look_through_it_than_measured_it() -> None:
     shown = board_seen_from((0, 0, -1.5), (0.2, 0, -1.5), (-0.2, 0.1, -1.4), (0, -0.1, -1.6))
-    through = [(replace(item, range=np.full_like(item.range, WALLS_AT)), pose) for item, pose in shown]
+    through = [(replace(item, range=np.full_like(item.range, 4)), pose) for item, pose in shown]
     unsure = [(replace(item, confidence=np.full_like(item.confidence, 60)), pose) for item, pose in through]
     assert area_near_board([shown[0], through[1]]) > 0.7
     assert area_near_board([shown[0], *through[1:3]]) < 0.1
@@ -175,7 +174,7 @@ def test_a_surface_is_removed_where_more_panoramas_look_through_it_than_measured
 
 def test_the_pane_of_a_window_remains_although_another_panorama_looks_through_it() -> None:
     shown = board_seen_from((0, 0, -1.5), (0.2, 0, -1.5))
-    through = replace(shown[1][0], range=np.full_like(shown[1][0].range, WALLS_AT)), shown[1][1]
+    through = replace(shown[1][0], range=np.full_like(shown[1][0].range, 4)), shown[1][1]
     for confidence, remains in ((WINDOW_CONFIDENCE, True), (WEAK_CONFIDENCE[0], False)):
         item = replace(shown[0][0], confidence=np.full_like(shown[0][0].confidence, confidence))
         assert (area_near_board([(item, shown[0][1]), through]) > 0.7) == remains
