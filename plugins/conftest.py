@@ -3,7 +3,17 @@
 import tomllib
 from pathlib import Path
 
-from tests.cli.conftest import capture, finished, finished_once, pano_mvs, quickstart, rendered, sample_cache, toy
+from tests.cli.conftest import (
+    capture,
+    finished,
+    finished_once,
+    of_all_processes,
+    pano_mvs,
+    quickstart,
+    rendered,
+    sample_cache,
+    toy,
+)
 from tests.conftest import mine, pytest_collection_finish
 
 

@@ -11,8 +11,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, PackageNotFoundError, distribution, entry_points
+from functools import cache, lru_cache
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, PackageNotFoundError, distribution, entry_points
 from typing import Any, TypeVar
 
 from pano_mvs.core.errors import PluginError
@@ -168,7 +168,7 @@ def origin_of(entry: EntryPoint) -> str:
     package = entry.module.partition(".")[0]
     if is_bundled(entry) and package != "pano_mvs":
         return package
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+    return " ".join(_name_and_version(entry.dist)) if entry.dist else entry.value
 
 
 @cache
@@ -183,7 +183,14 @@ def own_packages() -> frozenset[str]:
 
 def is_bundled(entry: EntryPoint) -> bool:
     """Return whether an entry point is one of our own distribution."""
-    return entry.dist is not None and entry.dist.name == DISTRIBUTION
+    return entry.dist is not None and _name_and_version(entry.dist)[0] == DISTRIBUTION
+
+
+@lru_cache(maxsize=1024)
+def _name_and_version(dist: Distribution) -> tuple[str, str]:
+    """Return the name and the version of a distribution; each of the two would parse the whole metadata again."""
+    metadata = dist.metadata
+    return metadata["Name"], metadata["Version"]
 
 
 def _remedy(entry: EntryPoint) -> str:

@@ -14,6 +14,7 @@ import shutil
 import stat
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,15 +74,20 @@ def kernels_digest(package: Path = PACKAGE) -> str:
 
 def count_compiled() -> int:
     """Return how many kernels all processes together have compiled into the cache."""
-    folder = os.environ.get(VARIABLE)
-    # Observers of runs call this every second; `Path.rglob` takes three times as long.
-    names = (name for _, _, names in os.walk(folder) for name in names) if folder else ()
-    return sum(name.endswith(".nbi") for name in names)
+    return sum(1 for _ in _compiled())
 
 
 def must_compile() -> bool:
     """Return whether no kernel of this version has been compiled on this machine, which the first run does."""
-    return os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0") and not count_compiled()
+    return os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0") and next(_compiled(), None) is None
+
+
+def _compiled() -> Iterator[str]:
+    """Yield the names of the files of compiled kernels."""
+    folder = os.environ.get(VARIABLE)
+    # Observers of runs count them every second; `Path.rglob` takes three times as long.
+    for _, _, names in os.walk(folder) if folder else ():
+        yield from (name for name in names if name.endswith(".nbi"))
 
 
 def user_cache_folder() -> Path:

@@ -41,7 +41,7 @@ def seen(ranges: NDArray[np.float32], normals: NDArray[np.float16] | None = None
 def scene() -> Scene:
     """A picture of the room, its true ranges, and three sources with theirs."""
     poses = capture_poses(4, seed=2, spread=0.4)
-    views = [render(default_room(), pose, SIZE) for pose in poses]
+    views = [render(default_room(), pose, SIZE, supersample=1) for pose in poses]
     sources = [
         SourceView(picture, seen(ranges), pose @ poses[0].inverse())
         for (picture, ranges), pose in zip(views[1:], poses[1:], strict=True)

@@ -41,7 +41,7 @@ LAYOUTS = ("cube", "octagon", "icosahedron")
 def panorama() -> View:
     """Picture, true ranges and pose of a tilted camera in the room."""
     pose = capture_poses(2, seed=3)[1]
-    return *render(default_room(), pose, SIZE), pose
+    return *render(default_room(), pose, SIZE, supersample=1), pose
 
 
 def smooth_panorama(size_hw: tuple[int, int] = SIZE) -> NDArray[np.uint8]:

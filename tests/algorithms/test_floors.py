@@ -36,7 +36,7 @@ FLOOR, CEILING = 1.3, -1.5
 def _room() -> tuple[list[Picture], list[Rigid3], list[NDArray[np.float32]]]:
     """Return pictures, poses and true ranges of a room whose views are as far apart as they can be."""
     poses = capture_poses(4, spread=0.7, tilt_deg=5.0)
-    views = [render(default_room(), pose, SIZE) for pose in poses]
+    views = [render(default_room(), pose, SIZE, supersample=1) for pose in poses]
     return [picture for picture, _ in views], poses, [truth for _, truth in views]
 
 
@@ -120,7 +120,7 @@ def _far_apart() -> tuple[list[Picture], list[Rigid3], NDArray[np.float32]]:
     """Return pictures, source_from_reference and the true range of view 0: the floor is seen from two sides."""
     centers = ((0.0, 0.0, 0.0), (2.2, -0.1, 0.4), (-2.2, 0.1, -0.9))
     poses = [Rigid3.from_center(rotation_from_rotvec((0, idx, 0)), center) for idx, center in enumerate(centers)]
-    views = [render(default_room(), pose, SIZE) for pose in poses]
+    views = [render(default_room(), pose, SIZE, supersample=1) for pose in poses]
     return [picture for picture, _ in views], poses[1:], views[0][1]
 
 

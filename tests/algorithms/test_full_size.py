@@ -36,7 +36,7 @@ def views() -> Views:
     Some rows of the reference show only noise, by which detail is judged. The second source is masked at its nadir.
     """
     poses = capture_poses(3, seed=1, spread=0.4)
-    pictures, truth = zip(*(render(default_room(), pose, SIZE) for pose in poses), strict=True)
+    pictures, truth = zip(*(render(default_room(), pose, SIZE, supersample=1) for pose in poses), strict=True)
     pictures[0][PLAIN] = np.random.default_rng(5).integers(120, 123, pictures[0][PLAIN].shape)
     masks = [np.ones(SIZE, np.bool_), np.ones(SIZE, np.bool_)]
     masks[1][150:] = False

@@ -159,6 +159,7 @@ def test_masked_areas_are_no_evidence(views: list[NDArray[np.uint8]]) -> None:
     assert not static_content(pictures, [~below] + [np.ones(SIZE_HW, np.bool_)] * 3).pixels.any()
 
 
+@pytest.mark.slow
 def test_margin_and_area(views: list[NDArray[np.uint8]]) -> None:
     pictures, _ = with_rigs(views, "helmet")
     narrow, wide = (static_content(pictures, margin_deg=margin).pixels for margin in (0.0, 3.0))

@@ -150,6 +150,7 @@ def test_a_network_outlines_what_is_in_the_middle() -> None:
     assert outline[~drawn.people & (view.weight > 0)].mean() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pose", "reach"), [("crouching", 0.2), ("sitting", 0.1), ("standing", 0.7)])
 def test_operators_are_found(pose: str, reach: float) -> None:
     """Below the camera and beside it, where they reach from below it to above the horizon."""

@@ -48,6 +48,7 @@ def test_a_mirror_is_found_where_the_frame_ends(seed: int) -> None:
     np.testing.assert_allclose(corners.max(axis=0), (*HIGH_XY, 2.5), atol=0.15)
 
 
+@pytest.mark.slow
 def test_walls_and_what_is_seen_before_them_are_no_mirrors() -> None:
     views = views_of(weak_room(seed=0), phantom=False)
     assert not find_mirrors(views, WALLS)

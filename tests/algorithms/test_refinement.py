@@ -44,7 +44,7 @@ SETTINGS = (0.2, 40.0, 900.0, 10.0, 0.05)
 def views() -> Views:
     """Pictures, true ranges and poses of three cameras in the room."""
     poses = capture_poses(3, seed=1, spread=0.4)
-    pictures, truth = zip(*(render(default_room(), pose, SIZE) for pose in poses), strict=True)
+    pictures, truth = zip(*(render(default_room(), pose, SIZE, supersample=1) for pose in poses), strict=True)
     return list(pictures), list(truth), poses
 
 
@@ -357,7 +357,7 @@ def test_a_source_that_shows_something_else_does_less_harm() -> None:
     """Two of three sources are turned by four pixels: the better half still contains one of them."""
     size = (96, 192)
     poses = capture_poses(4, seed=2, spread=0.3)
-    pictures, truth = zip(*(render(default_room(), pose, size) for pose in poses), strict=True)
+    pictures, truth = zip(*(render(default_room(), pose, size, supersample=1) for pose in poses), strict=True)
     spoilt = [pictures[1], *(np.roll(picture, 4, axis=1) for picture in pictures[2:])]
     off = np.float32(1) + np.random.default_rng(0).normal(0, 0.01, size).astype(np.float32)
     start = RangeMap(truth[0] * off, np.full(size, 100, np.uint8))
@@ -383,7 +383,7 @@ FaintViews = tuple[list[NDArray[np.uint8]], NDArray[np.float32], list[Rigid3]]
 def faint_views() -> FaintViews:
     """Faint pictures of the room, its true ranges in the first view, and the poses of the others."""
     poses = capture_poses(3, seed=2, spread=0.4)
-    rendered = [render(default_room(), pose, SMALL) for pose in poses]
+    rendered = [render(default_room(), pose, SMALL, supersample=1) for pose in poses]
     faint = [np.rint(100 + 0.06 * picture.astype(float)).astype(np.uint8) for picture, _ in rendered]
     return faint, rendered[0][1], [pose @ poses[0].inverse() for pose in poses[1:]]
 

@@ -177,14 +177,23 @@ def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     assert moved_ceilings(views, [floor, replace(ceiling, uncertainty=0.01)])[1].y == ceiling.y
 
 
-@pytest.mark.parametrize("noise", [0.0, 3.0])
-@pytest.mark.parametrize("darker", [0.0, 10.0], ids=["no creases", "faint creases"])
+@pytest.mark.parametrize(
+    ("darker", "noise"),
+    [
+        pytest.param(0.0, 3.0, marks=pytest.mark.slow),
+        (10.0, 0.0),
+        pytest.param(0.0, 0.0, marks=pytest.mark.slow),
+        pytest.param(10.0, 3.0, marks=pytest.mark.slow),
+    ],
+    ids=["no creases, noise", "faint creases", "no creases", "faint creases, noise"],
+)
 def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float, noise: float) -> None:
     """One faint edge counted as the crease with the floor and as a skirting board."""
     views, planes = _plain_ceiling(_noisy_box(noise, darker), 1.0)
     assert moved_ceilings(views, planes)[1].y == pytest.approx(-HALF[1], rel=0.012 if darker else 0.003)
 
 
+@pytest.mark.slow
 def test_a_plain_ceiling_stays_where_creases_are_clear() -> None:
     """Its ranges are exact and weak; a tenth of a degree, a seventh of a pixel, is 0.4 % of its height."""
     structure = _noisy_box(3.0, None).structure()
@@ -208,7 +217,9 @@ def _noisy_box(noise: float, darker: float | None) -> Box:
     return box
 
 
-@pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
+@pytest.mark.parametrize(
+    ("grey", "count"), [pytest.param(True, 0, marks=pytest.mark.slow), (False, 1)], ids=["one grey", "clear creases"]
+)
 def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, count: int) -> None:
     box = Box()
     for name, center in zip(box.maps, CENTERS, strict=True):
@@ -218,6 +229,7 @@ def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, co
     assert len(supposed_ceiling(views, planes[:1])) == count
 
 
+@pytest.mark.slow
 def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     """Its ranges are 20 % too large, so that creases are clearest at the lowest height that is searched."""
     box = Box()
@@ -228,6 +240,7 @@ def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     assert moved_ceilings(views, [floor, ceiling])[1] == ceiling
 
 
+@pytest.mark.slow
 def test_a_camera_above_a_tried_ceiling_has_no_creases_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A crease below the camera would be taken for one with the floor."""
     box, downs = Box(), []

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
+from pano_mvs.core.locks import locked
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.engine.conftest import finished, finished_once, toy
 from tests.synthetic.capture_files import write_capture
@@ -37,32 +38,55 @@ Command = Callable[..., Outcome]
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def of_all_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all processes of the test run share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@pytest.fixture(scope="session")
+def rendered(of_all_processes: Path) -> Path:
     """Four rendered panoramas of the synthetic room with their truth; not to be changed."""
-    folder = tmp_path_factory.mktemp("rendered")
-    write_capture(folder, default_room(), capture_poses(4, spread=0.4), size_hw=SIZE_HW)
+
+    def write(folder: Path) -> None:
+        write_capture(folder, default_room(), capture_poses(4, spread=0.4), size_hw=SIZE_HW)
+
+    return made_once(of_all_processes / "rendered", write)
+
+
+@pytest.fixture(scope="session")
+def quickstart(rendered: Path, of_all_processes: Path) -> tuple[Path, str]:
+    """Output folder, beside its cache, and text of a quickstart run on the rendered capture; not to be changed."""
+
+    def run(folder: Path) -> None:
+        arguments = (
+            *f"run quickstart --images {rendered / 'images'} --out {folder / 'out'} --cache {folder / 'cache'}".split(),
+            *f"--set scores.truth={rendered / 'truth'}".split(),
+            *SMALL,
+        )
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        (folder / "printed.txt").write_text(result.output, encoding="utf-8")
+
+    folder = made_once(of_all_processes / "quickstart", run)
+    return folder / "out", (folder / "printed.txt").read_text(encoding="utf-8")
+
+
+def made_once(folder: Path, make: Callable[[Path], None]) -> Path:
+    """Return a folder that the first process of the test run to ask for it makes; the others wait."""
+    done = folder.with_name(f"{folder.name}.done")
+    with locked(folder.with_name(f"{folder.name}.lock")):
+        if not done.exists():
+            folder.mkdir()
+            make(folder)
+            done.touch()
     return folder
 
 
 @pytest.fixture(scope="session")
-def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Output folder, beside its cache, and text of a quickstart run on the rendered capture; not to be changed."""
-    folder = tmp_path_factory.mktemp("quickstart")
-    arguments = (
-        *f"run quickstart --images {rendered / 'images'} --out {folder / 'out'} --cache {folder / 'cache'}".split(),
-        *f"--set scores.truth={rendered / 'truth'}".split(),
-        *SMALL,
-    )
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    return folder / "out", result.output
-
-
-@pytest.fixture(scope="session")
-def sample_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sample_cache(of_all_processes: Path) -> Path:
     """A cache for all that runs the quickstart on the sample, in all processes of the test run: it is computed once."""
-    folder = tmp_path_factory.getbasetemp()
-    return (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "sample-cache"
+    return of_all_processes / "sample-cache"
 
 
 @pytest.fixture

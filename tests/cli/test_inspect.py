@@ -162,6 +162,7 @@ def test_a_sweep_from_coarse_to_fine_says_that_it_tried_less(run: Path) -> None:
     assert any("tests a few ranges around a guide" in note for note in found["notes"])
 
 
+@pytest.mark.slow
 def test_a_sweep_with_floors_says_that_it_compared_more(run: Path) -> None:
     levelled = "  levelled: {use: poses.level, evidence: cameras}\n  floors: {use: depth.floors}\n  views: "
     (run / "floors.yaml").write_text(WORKFLOW.replace("  views: ", levelled))

@@ -52,7 +52,14 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("mine")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        # The command is started in a process, to see which libraries it loads.
+        pytest.param(kind, marks=pytest.mark.slow) if kind in ("command", "sweep_backend") else kind
+        for kind in KINDS
+    ],
+)
 def test_a_new_plugin_keeps_its_contract(written: Path, kind: str) -> None:
     example = {"example": EXAMPLES[kind].format(name=f"new_{kind}")} if kind in EXAMPLES else {}
     contract_tests = getattr(conformance, KINDS[kind].contract_tests)(written / f"new_{kind}.py", **example)
@@ -145,6 +152,7 @@ def test_a_new_capture_reader_reads_its_list(pano_mvs: Command, mine: Path, toy:
     assert [stage["units"] for stage in run_json(Path("out/look"))["stages"]] == [2]
 
 
+@pytest.mark.slow
 def test_a_run_knows_readers_of_files_from_the_start(
     mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,6 +242,7 @@ def test_a_package_with_an_environment_of_its_own_has_the_stage_of_a_file(kind: 
     compile(files["test_mine.py"], "test_mine.py", "exec")
 
 
+@pytest.mark.slow
 def test_a_package_is_written_and_its_test_passes(pano_mvs: Command) -> None:
     result = pano_mvs("plugin", "new", "filter", "mine", "--environment", "overlay", "--dir", "some where")
     assert result.code == 0, result.text

@@ -8,6 +8,7 @@ import shutil
 import textwrap
 from collections import defaultdict
 from contextlib import suppress
+from functools import cache
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -77,9 +78,14 @@ def commands(script: str) -> list[list[str]]:
     return [found[1:] for found in words if found and Path(found[0]).name == "pano-mvs"]
 
 
+@cache
+def _program() -> Any:
+    return typer.main.get_command(app)
+
+
 def parse(arguments: list[str]) -> None:
     """Parse a command line as the program does, down to the command that it calls, without calling it."""
-    command: Any = typer.main.get_command(app)
+    command = _program()
     if arguments[0] in ("--install-completion", "--show-completion"):  # would do so, here and now
         assert any(arguments[0] in parameter.opts for parameter in command.params)
         return

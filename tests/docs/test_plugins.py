@@ -40,7 +40,9 @@ BESIDE_STAGES = [kind for kind in KINDS if not KINDS[kind].in_workflow]
 
 
 @pytest.mark.usefixtures("mine")
-@pytest.mark.parametrize("kind", BESIDE_STAGES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind == "command" else kind for kind in BESIDE_STAGES]
+)
 def test_an_example_beside_stages_keeps_its_contract(kind: str, tmp_path: Path) -> None:
     name = PLUGINS[kind]
     plugin = tmp_path / f"{name}.py"

@@ -22,8 +22,9 @@ from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 
 
 def heed_interrupts() -> None:
-    """Let a new process take interrupts, which one that a script starts in its background ignores; for `preexec_fn`."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Let a new process take the signals that one in a script's background, or below nohup, ignores; a `preexec_fn`."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 PATIENCE_S = 300.0

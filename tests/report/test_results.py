@@ -268,6 +268,7 @@ def test_tiny_pictures_end_too() -> None:
     assert picture(np.zeros((1, 1, 3), np.uint8), width=8, most_bytes=1).size_hw == (1, 1)
 
 
+@pytest.mark.slow
 def test_five_thousand_views_fit_with_all_their_pictures(tmp_path: Path) -> None:
     """The text of the largest page, and all pictures at the largest size that each may have, base64 and all."""
     write_report(tmp_path, RunSummary.from_json(large(5000)))

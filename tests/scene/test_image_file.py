@@ -307,7 +307,7 @@ def test_heic_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch
         decode_image(tmp_path / "a.heic")
 
 
-BUDGETS = [(".jpg", 8192, 110e6), (".png", 2048, 10e6), (".tif", 2048, 26e6)]
+BUDGETS = [pytest.param(".jpg", 8192, 110e6, marks=pytest.mark.slow), (".png", 2048, 10e6), (".tif", 2048, 26e6)]
 
 
 @pytest.mark.parametrize(("suffix", "width", "budget"), BUDGETS)

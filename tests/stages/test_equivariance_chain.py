@@ -47,12 +47,14 @@ def test_rolled_pictures_give_the_rolled_range(found: dict[str, Equivariance], s
     assert above_1_percent < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "most"), [("depth", 1.2e-2), ("slanted", 8e-3), ("planes", 8e-3)])
 def test_a_turned_reference_gives_the_turned_range(found: dict[str, Equivariance], stage: str, most: float) -> None:
     """At 80 rows; the benchmark holds larger pictures against the bar of 5e-3."""
     assert found[stage].turn[0] <= most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["depth", "checked", "planes"])
 def test_seam_and_poles_are_no_worse_than_the_middle(found: dict[str, Equivariance], stage: str) -> None:
     assert found[stage].seam.there <= 1.2 * found[stage].seam.elsewhere + 0.01
@@ -61,6 +63,7 @@ def test_seam_and_poles_are_no_worse_than_the_middle(found: dict[str, Equivarian
     assert found[stage].poles.there <= 1.2 * found[stage].poles.elsewhere + 0.055
 
 
+@pytest.mark.slow
 def test_a_line_tells_all(found: dict[str, Equivariance]) -> None:
     assert len(row("x", "depth", found["depth"])) == 12
 

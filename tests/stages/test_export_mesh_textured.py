@@ -114,6 +114,7 @@ def test_a_group_without_ranges_has_no_mesh_and_a_note_says_so(inputs: Inputs, t
     assert ctx.notes[0].startswith("no mesh_textured_1.glb: no panorama measured a surface")
 
 
+@pytest.mark.slow
 def test_few_range_maps_are_in_memory_at_once(inputs: Inputs, tmp_path: Path) -> None:
     """The two panoramas three times."""
     alive: weakref.WeakSet[RangeMap] = weakref.WeakSet()

@@ -25,9 +25,9 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> tuple[RangeMap, list[Panor
     poses = capture_poses(3, seed=1, spread=0.4)
     panoramas = []
     for number, pose in enumerate(poses):
-        write_png(folder / f"{number}.png", render(default_room(), pose, FILE)[0])
+        write_png(folder / f"{number}.png", render(default_room(), pose, FILE, supersample=1)[0])
         panoramas.append(Panorama(FilePart(folder / f"{number}.png"), SIZE, FILE, nadir_deg=20))
-    truth = render(default_room(), poses[0], SIZE)[1]
+    truth = render(default_room(), poses[0], SIZE, supersample=1)[1]
     seen = panoramas[0].load_mask()
     given = RangeMap(np.where(seen, truth, np.float32(np.nan)), np.where(seen, np.uint8(200), np.uint8(0)))
     return given, panoramas, [Pose(pose) for pose in poses]
@@ -52,7 +52,7 @@ def test_ranges_have_the_size_of_the_file(unit: tuple[RangeMap, list[Panorama], 
     found.check()
     assert found.range.shape == FILE
     assert {path.name for path in tmp_path.iterdir()} == {"range", "confidence"}
-    truth = render(default_room(), unit[2][0].cam_from_world, FILE)[1]
+    truth = render(default_room(), unit[2][0].cam_from_world, FILE, supersample=1)[1]
     assert np.nanmedian(np.abs(found.range / truth - 1)) < 0.01
     at_once = at_full_size(unit, tmp_path / "again", FullSizeParams(max_sources=1))
     np.testing.assert_array_equal(at_once.confidence, found.confidence)
@@ -77,13 +77,14 @@ def test_the_width_is_limited(
     assert (found is unit[0]) == (rows == 64)
 
 
+@pytest.mark.slow
 def test_a_blurred_panorama_is_only_enlarged(unit: tuple[RangeMap, list[Panorama], list[Pose]], tmp_path: Path) -> None:
     """Pixels that were interpolated by whoever stitched it say nothing new; the sources are not even read."""
     given, panoramas, poses = unit
     given = RangeMap(
         given.range.repeat(8, axis=0).repeat(8, axis=1), given.confidence.repeat(8, axis=0).repeat(8, axis=1)
     )
-    small = render(default_room(), poses[0].cam_from_world, (256, 512))[0]
+    small = render(default_room(), poses[0].cam_from_world, (256, 512), supersample=1)[0]
     write_png(tmp_path / "blurred.png", np.asarray(cv2.resize(small, (2048, 1024)), np.uint8))
     blurred = Panorama(FilePart(tmp_path / "blurred.png"), SIZE, (1024, 2048), nadir_deg=20)
     missing = [Panorama(FilePart(tmp_path / "missing.png"), SIZE, (1024, 2048)) for _ in panoramas[1:]]

@@ -70,7 +70,7 @@ def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
     assert ctx.metrics["confirmed_share_median"] > 0.4
 
 
-@pytest.mark.parametrize(("matched", "correct"), [(False, True), (True, False)])
+@pytest.mark.parametrize(("matched", "correct"), [pytest.param(False, True, marks=pytest.mark.slow), (True, False)])
 def test_without_matches_or_permission_it_only_reports(
     tiny: TinyCapture, ctx: Context, matched: bool, correct: bool
 ) -> None:

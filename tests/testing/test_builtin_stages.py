@@ -45,8 +45,15 @@ INPUTS: dict[str, dict[str, Any]] = {
     "features.aliked": {"features": None},  # those of the tiny capture, which the stage returns, too, are everywhere
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
-# They run neural networks or render, a second or more at each call.
-SLOW = ("export.mesh_textured", "features.aliked", "masks.operator", "poses.localise")
+# They run neural networks, render or start a process, half a second or more at each call.
+SLOW = (
+    "export.floor_plan",
+    "export.mesh",
+    "export.mesh_textured",
+    "features.aliked",
+    "masks.operator",
+    "poses.localise",
+)
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 

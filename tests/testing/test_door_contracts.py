@@ -30,7 +30,10 @@ from pano_mvs.testing.conformance import (
 )
 from pano_mvs.testing.observer_contract import runs_of
 
-KEPT = [*executor_contract_tests("serial"), *executor_contract_tests("processes")]
+KEPT = [
+    *executor_contract_tests("serial"),
+    *(pytest.param(one, marks=pytest.mark.slow) for one in executor_contract_tests("processes")),
+]
 
 
 @pytest.mark.parametrize("contract_test", KEPT, ids=str)
@@ -246,6 +249,7 @@ def test_commands_that_break_their_contract_are_found(mine: Path, given: dict[st
     assert broken([one for one in command_contract_tests(mine / "mine.py") if one.name.endswith(test)]) == {}
 
 
+@pytest.mark.slow
 def test_commands_that_load_large_libraries_for_their_help_are_found(mine: Path) -> None:
     text = COMMAND.format(name="mine", parameter=NAMED, doc="Be mine.", body="print(name)")
     (mine / "mine.py").write_text(text)

@@ -142,6 +142,7 @@ def test_a_written_scene_is_read_back_with_its_truth(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read, image)
 
 
+@pytest.mark.slow
 def test_a_far_wall_does_not_flicker_between_views() -> None:
     """Texture finer than a pixel once made far walls look different from every place."""
     scene = courtyard(turned=False)

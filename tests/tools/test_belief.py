@@ -70,6 +70,7 @@ def test_a_table_is_the_same_from_its_file(table: Path, tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_text() == table.read_text()
 
 
+@pytest.mark.slow
 def test_the_stored_evidence_is_calibrated_and_says_more_than_what_was_doubted_when_it_was_measured() -> None:
     cameras = decidable(read([TABLE, LEARNED]))
     again = fit(cameras).probabilities(cameras.columns)
@@ -84,6 +85,7 @@ def test_the_stored_evidence_is_calibrated_and_says_more_than_what_was_doubted_w
     assert FITTED.probability({}) == pytest.approx(cameras.right.mean(), abs=0.02)
 
 
+@pytest.mark.slow
 def test_tours_that_were_left_out_are_judged_better_with_their_links_than_without() -> None:
     cameras = decidable(read([TABLE, LEARNED]))
     tours = cameras[np.isin(cameras.place, np.unique(read_table(LEARNED).place))]

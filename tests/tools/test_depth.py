@@ -189,6 +189,7 @@ def test_the_papers_figures_stand_where_they_belong() -> None:
     assert reported("smallroom", 2, 9, "known") == reported("court", 4, 7, "known") == "–"
 
 
+@pytest.mark.slow
 def test_quickstart_gives_a_plain_ceiling_its_plane(tmp_path: Path) -> None:
     """With census alone, plain surfaces win at chance ranges, and no plane fits them."""
     room = scene_capture(white_room(views=3, seed=12), tmp_path, width=192)
@@ -290,6 +291,7 @@ def test_half_a_sphere_is_half_complete() -> None:
     assert abs(completeness(upper, np.zeros((1, 3))) - 0.5) < 0.01
 
 
+@pytest.mark.slow
 def test_the_range_of_a_rendered_wall_is_exact() -> None:
     wall = Boxes(np.array([[0.0, 2.1, 0.0, 9.0, 0.1, 9.0, 1.0, 0.0]]), np.array([[PLASTER, 0]]), np.ones((1, 3)))
     pose = Rigid3.from_center(level_rotation(0.0, np.zeros(2)), np.zeros(3))  # towards y
@@ -315,6 +317,7 @@ def test_a_view_of_a_drawn_room_is_compared_in_both_scales() -> None:
     assert shares["walls within 5 %"] == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_the_true_plan_of_a_house_has_no_errors() -> None:
     lower, upper = true_storeys("house_08")
     assert upper.floor > lower.floor + 2

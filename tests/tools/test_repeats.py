@@ -29,7 +29,7 @@ def seen(scene: Scene, places: NDArray[np.float64], *, down: float = 0.2) -> NDA
     colors = []
     for x, z in places:
         pose = Rigid3.from_center(np.eye(3), (x, -down, z))
-        colors.append(render(scene.room, pose, SIZE)[0][SIZE[0] - 6 :].astype(float))
+        colors.append(render(scene.room, pose, SIZE, supersample=1)[0][SIZE[0] - 6 :].astype(float))
     return np.array(colors)
 
 
@@ -78,15 +78,15 @@ def test_twin_rooms_are_congruent_but_for_unique_things(congruence: Literal["shi
 @pytest.mark.parametrize("name", REPEATS)
 def test_ranges_are_exact_and_a_seed_is_a_capture(name: str) -> None:
     scene, again, other = (REPEATS[name](seed=seed, views=4, exposure=0.1) for seed in (5, 5, 6))
-    image, ranges = scene.view(1, SIZE)
+    image, ranges = scene.view(1, SIZE, supersample=1)
     exact = range_along(scene.room, scene.poses[1].center, ray_grid(SIZE).reshape(-1, 3) @ scene.poses[1].rotation)
     np.testing.assert_array_equal(np.nan_to_num(ranges, nan=np.inf).ravel(), exact.astype(np.float32))
-    np.testing.assert_array_equal(again.view(1, SIZE)[0], image)
-    assert np.abs(other.view(1, SIZE)[0].astype(float) - image).mean() > 3
+    np.testing.assert_array_equal(again.view(1, SIZE, supersample=1)[0], image)
+    assert np.abs(other.view(1, SIZE, supersample=1)[0].astype(float) - image).mean() > 3
     assert np.ptp(np.log(scene.gains)) > 0.02
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_drawn_captures_have_their_cameras_in_free_places(seed: int) -> None:
     scene = draw_capture(seed)
     assert 6 <= len(scene.poses) <= 12

@@ -20,6 +20,7 @@ def test_the_models_in_use_are_those_of_the_stored_areas() -> None:
         np.testing.assert_allclose(found, expected, atol=0.01)
 
 
+@pytest.mark.slow
 def test_kinds_of_places_that_were_left_out_lose_little() -> None:
     areas = read_areas()
     found, lost = np.array(list(left_out(areas).values())).T

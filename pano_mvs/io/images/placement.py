@@ -121,9 +121,9 @@ def _crop_size(
         return (width, height), ("its GPano metadata do not state the size of the part; that of the image is used",)
     if crop_height is None:
         assert crop_width is not None
-        crop_height = round(crop_width * height / width)
+        crop_height = (crop_width * height + width // 2) // width
     elif crop_width is None:
-        crop_width = round(crop_height * width / height)
+        crop_width = (crop_height * width + height // 2) // height
     if (crop_height, crop_width) == size_hw:
         return (crop_width, crop_height), ()
     if abs(width * crop_height - height * crop_width) > max(width, height, crop_width, crop_height):

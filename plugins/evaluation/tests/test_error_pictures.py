@@ -39,7 +39,7 @@ def test_missing_is_black_and_what_does_not_count_is_grey() -> None:
     assert [tuple(color) for color in colors[0, 1:]] == [BLACK, GREY]
 
 
-@pytest.mark.parametrize("size", [(8, 16), (512, 1024), (600, 1200)])
+@pytest.mark.parametrize("size", [pytest.param((8, 16), marks=pytest.mark.slow), (600, 1200)])
 def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(
     tmp_path: Path, size: tuple[int, int]
 ) -> None:

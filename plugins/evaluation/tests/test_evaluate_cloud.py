@@ -75,6 +75,7 @@ def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
     assert "give the true poses" in failed.flat
 
 
+@pytest.mark.slow
 def test_truth_may_be_range_maps_in_files_beside_the_poses(
     pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
 ) -> None:
@@ -106,6 +107,7 @@ def test_only_what_the_cameras_used_see_must_be_found(
     assert score["accuracy"] == 1
 
 
+@pytest.mark.slow
 def test_the_picture_shows_each_view_and_the_cloud(
     pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
 ) -> None:
@@ -146,6 +148,7 @@ def test_the_cloud_of_a_run_lies_in_the_frame_of_a_reference_without_poses(
     assert (named.code, "give the true poses" in named.flat) == (2, True)
 
 
+@pytest.mark.slow
 def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: np.ndarray) -> None:
     reference = save(tmp_path / "a.ply", surface)
     turned = Similarity3(1.0, rotation_from_rotvec([0.9, 0.4, -0.2]), np.zeros(3))

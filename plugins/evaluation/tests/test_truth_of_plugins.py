@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from pano_mvs.cli.plugins.new import EXAMPLES
 from tests.cli.test_plugin_new import written_into
 
 
+@pytest.mark.slow
 def test_evaluate_knows_readers_of_files_from_the_start(mine: Path, tmp_path: Path) -> None:
     """In a process of its own, in which nothing has imported the user's files before."""
     written_into(mine, "pose_reader")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
@@ -56,14 +57,7 @@ def vary_page(found: Variation) -> str:
         for capture, result in found.by_capture.items()
     ]
     failed = [run for run in found.runs if run.exit_code is not None and not run.is_finished]
-    environment = Environment(
-        loader=PackageLoader("pano_mvs_experiments", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("vary.html.j2").render(
+    return _template().render(
         found=found,
         size=" × ".join(
             f"{count} {plural(count, what)}"
@@ -80,6 +74,18 @@ def vary_page(found: Variation) -> str:
         ],
         done=sum(run.exit_code is not None for run in found.runs),
     )
+
+
+@cache  # the page is written after each run
+def _template() -> Template:
+    environment = Environment(
+        loader=PackageLoader("pano_mvs_experiments", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("vary.html.j2")
 
 
 def _table(found: Variation, title: str, result: CaptureResult, runs: Sequence[VariedRun]) -> ResultTable:

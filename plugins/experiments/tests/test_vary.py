@@ -57,6 +57,7 @@ def computed(found: dict[str, Any]) -> list[int]:
 
 
 GRID = ("--set", "scaled.by=2,3,5,7", "--set", "all.rng_seed=0,1,2")
+SMALL_GRID = ("--set", "scaled.by=2,3", "--set", "all.rng_seed=0,1")
 
 
 def test_a_grid_of_12_computes_each_distinct_unit_once(toy: Toy, pano_mvs: Command) -> None:
@@ -94,14 +95,14 @@ def test_runs_share_what_is_temporary_and_drop_it_when_all_have_ended(tmp_path: 
 
 
 def test_the_same_command_resumes(toy: Toy, pano_mvs: Command) -> None:
-    assert vary(pano_mvs, toy, *GRID).code == 0
+    assert vary(pano_mvs, toy, *SMALL_GRID).code == 0
     before = results(toy)
-    assert vary(pano_mvs, toy, *GRID).code == 0
-    assert computed(results(toy)) == [0] * 12
+    assert vary(pano_mvs, toy, *SMALL_GRID).code == 0
+    assert computed(results(toy)) == [0] * 4
     assert [run["out"] for run in results(toy)["runs"]] == [run["out"] for run in before["runs"]]
     shutil.rmtree(toy.folder / "v" / "capture" / "by=3,rng_seed=1")
     (toy.folder / "v" / "vary.csv").unlink()
-    assert vary(pano_mvs, toy, *GRID).code == 0
+    assert vary(pano_mvs, toy, *SMALL_GRID).code == 0
     assert (toy.folder / "v" / "capture" / "by=3,rng_seed=1" / "all.txt").is_file()
     assert (toy.folder / "v" / "vary.csv").is_file()
 
@@ -134,14 +135,14 @@ def test_a_list_and_draws_from_a_file(toy: Toy, pano_mvs: Command) -> None:
     assert vary(pano_mvs, toy, "--vary", file).code == 0
     assert [each["name"] for each in results(toy)["combinations"]] == ["default", "by=4,retries=2"]
     assert results(toy)["varied"] == ["scaled.by", "mean.retries"]
-    file.write_text("random: {count: 3, seed: 1, settings: {scaled.by: {min: 1, max: 9}}}")
+    file.write_text("random: {count: 2, seed: 1, settings: {scaled.by: {min: 1, max: 9}}}")
     assert "holds an experiment that varies scaled.by, mean.retries" in vary(pano_mvs, toy, "--vary", file).flat
     shutil.rmtree(toy.folder / "v")
     assert vary(pano_mvs, toy, "--vary", file).code == 0
     drawn = [each["settings"]["scaled.by"] for each in results(toy)["combinations"]]
-    assert len(set(drawn)) == 3
+    assert len(set(drawn)) == 2
     assert vary(pano_mvs, toy, "--vary", file, "--set", "mean.retries=0,1").code == 0
-    assert len(results(toy)["combinations"]) == 6
+    assert len(results(toy)["combinations"]) == 4
     assert "0 units computed" in vary(pano_mvs, toy, "--vary", file, "--set", "mean.retries=0,1").text
 
 
@@ -313,6 +314,7 @@ def test_a_capture_that_cannot_be_read_is_in_the_table(toy: Toy, captures: list[
     assert "(2 of 3)" in done.flat
 
 
+@pytest.mark.slow
 def test_an_interrupted_experiment_resumes(toy: Toy, pano_mvs: Command) -> None:
     words = [sys.executable, "-m", "pano_mvs", "vary", str(toy.folder / "wf.yaml"), "--set", "scaled.by=2,3,4"]
     words += ["--out", str(toy.folder / "v"), "--cache", str(toy.folder / "cache"), "--executor", "serial"]
@@ -452,7 +454,7 @@ def test_the_folder_of_another_combination_is_refused(toy: Toy, captures: list[P
 
 
 def test_json_and_csv_hold_the_same(toy: Toy, pano_mvs: Command) -> None:
-    done = vary(pano_mvs, toy, *GRID, "--metric", "scaled.value", "--json")
+    done = vary(pano_mvs, toy, *SMALL_GRID, "--metric", "scaled.value", "--json")
     assert done.code == 0, done.text
     found = results(toy)
     text = done.text if done.text.startswith("{") else done.text[done.text.index("\n{") :]
@@ -460,7 +462,7 @@ def test_json_and_csv_hold_the_same(toy: Toy, pano_mvs: Command) -> None:
     assert printed == found
     with (toy.folder / "v" / "vary.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 12
+    assert len(rows) == 4
     for row, run in zip(rows, found["runs"], strict=True):
         assert row["combination"] == run["combination"]
         assert f"by={row['scaled.by']},rng_seed={row['all.rng_seed']}" == row["combination"]

@@ -100,6 +100,7 @@ def test_ranges_keep_four_digits_and_gaps() -> None:
     assert encode_ranges(np.full((2, 4), np.nan, np.float32))[1:] == (1.0, 2.0)
 
 
+@pytest.mark.slow
 def test_tiles_of_all_levels_cover_the_panorama() -> None:
     image = world_color(np.random.default_rng(0).normal(size=(1024, 2048, 3)))
     tiles = list(panorama_tiles(image, *tile_layout(2048, 8192)))

@@ -97,6 +97,7 @@ def test_a_photograph_is_localised(
     assert 0 < found.error_px < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal_px", [None, 1.05 * FOCAL_PX])
 def test_patches_refine_the_camera(model: Model, focal_px: float | None) -> None:
     """A sharp picture with distortion, as a phone takes it: a fifth of the error that key points alone may have."""
@@ -204,6 +205,7 @@ def test_a_key_point_counts_once_however_many_panoramas_match_it(
     assert "key points, agree with one pose" in found
 
 
+@pytest.mark.slow
 def test_key_points_keep_their_place_when_the_photograph_is_reduced(taken: tuple[Picture, Rigid3]) -> None:
     large = np.asarray(cv2.resize(taken[0], (3200, 2400), interpolation=cv2.INTER_CUBIC), np.uint8)
     pixels, reduced = photograph_keypoints(taken[0]).pixels_px, photograph_keypoints(large).pixels_px

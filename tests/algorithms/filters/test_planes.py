@@ -28,7 +28,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="module")
 def white() -> Wall:
     """A view of the white room, its ranges, and the map that chance makes of plain paint; the outline is seen."""
-    image, ranges = white_room(turned=False).view(0, SIZE)
+    image, ranges = white_room(turned=False).view(0, SIZE, supersample=1)
     _, bare = plain_surfaces(image, 8.0)
     noise = np.random.default_rng(1)
     found = np.where(bare, noise.uniform(1, 6, SIZE), ranges * (1 + 0.004 * noise.standard_normal(SIZE)))
@@ -76,7 +76,7 @@ def test_it_does_not_matter_how_the_camera_is_turned(turn: tuple[float, float, f
     """The ceiling may lie about a pole or across the seam."""
     scene = white_room(turned=False)
     pose = Rigid3(rotation_from_rotvec(turn), np.zeros(3))
-    image, truth = render(scene.room, pose, SIZE)
+    image, truth = render(scene.room, pose, SIZE, supersample=1)
     _, bare = plain_surfaces(image, 8.0)
     ceiling = bare & ((ray_grid(SIZE) @ pose.rotation)[..., 1] < -0.85)
     found = as_map(np.where(bare, 1.9, truth), np.where(bare, HIDDEN, TRUSTED))
@@ -85,7 +85,7 @@ def test_it_does_not_matter_how_the_camera_is_turned(turn: tuple[float, float, f
 
 
 def test_textured_surfaces_and_balls_are_left_alone() -> None:
-    image, truth = render(default_room(), Rigid3.identity(), SIZE)
+    image, truth = render(default_room(), Rigid3.identity(), SIZE, supersample=1)
     found = as_map(truth * (1 + 0.05 * rng().standard_normal(SIZE)), TRUSTED)
     np.testing.assert_array_equal(lay_planes(found, image, rng=rng()).range, found.range)
     plain = np.full((*SIZE, 3), 128, np.uint8)

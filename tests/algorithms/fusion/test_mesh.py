@@ -101,6 +101,7 @@ def test_another_program_reads_it_and_finds_one_hole(trimmed: Path) -> None:
     assert np.abs(edges.points - WINDOW[0]).max(axis=1).max() < 1.5 * WINDOW[1]
 
 
+@pytest.mark.slow
 def test_untrimmed_it_is_closed(tmp_path: Path) -> None:
     params = MeshParams(trim=0, depth=5, max_points=3000)
     read = pyvista.read(mesh(room_cloud(window=False), None, params, context(tmp_path)).files["mesh.ply"])

@@ -154,6 +154,7 @@ def area_near_board(maps: list[tuple[RangeMap, Rigid3]]) -> float:
     return float(areas[near].sum())
 
 
+@pytest.mark.slow
 def test_a_thin_board_that_is_seen_from_both_sides_remains() -> None:
     """Both sides once cancelled each other, and smoothing removed what was left."""
     both = board_seen_from((0, 0, -1.5), (0.2, 0, 1.5), (-0.2, 0.1, -1.4), (0, -0.1, 1.6))
@@ -161,6 +162,7 @@ def test_a_thin_board_that_is_seen_from_both_sides_remains() -> None:
     assert area_near_board(both[::2]) > 0.7
 
 
+@pytest.mark.slow
 def test_a_surface_is_removed_where_more_panoramas_look_through_it_than_measured_it() -> None:
     shown = board_seen_from((0, 0, -1.5), (0.2, 0, -1.5), (-0.2, 0.1, -1.4), (0, -0.1, -1.6))
     through = [(replace(item, range=np.full_like(item.range, 4)), pose) for item, pose in shown]

@@ -136,6 +136,13 @@ def room() -> Room:
     return poses, pictures
 
 
+@pytest.fixture(scope="module")
+def room_aligned(room: Room) -> Poses:
+    """The tracks of the room, aligned on its pictures; not to be changed."""
+    poses, pictures = room
+    return align_tracks(poses, pictures.__getitem__)
+
+
 def true_deviations_px(poses: Poses, of_point: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far observations are from where they would show what the first observation of their point shows."""
     moved = np.einsum(
@@ -155,9 +162,8 @@ def shown_points(poses: Poses, ranges: NDArray[Any]) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow
-def test_alignment_places_observations_several_times_as_well_and_says_how_well(room: Room) -> None:
-    poses, pictures = room
-    aligned = align_tracks(poses, pictures.__getitem__)
+def test_alignment_places_observations_several_times_as_well_and_says_how_well(room: Room, room_aligned: Poses) -> None:
+    poses, aligned = room[0], room_aligned
     aligned.check()
     ranges = np.linalg.norm(poses.points_in_world[poses.track_point_idx] - poses.centers[poses.track_image_idx], axis=1)
     shown = shown_points(poses, ranges)
@@ -173,34 +179,32 @@ def test_alignment_places_observations_several_times_as_well_and_says_how_well(r
     assert np.array_equal(aligned.points_in_world, poses.points_in_world)
 
 
-def test_what_the_mask_ignores_is_not_aligned(room: Room) -> None:
+def test_what_the_mask_ignores_is_not_aligned(room: Room, room_aligned: Poses) -> None:
     """Observations whose patches reach into a masked area keep their bearings; the others are aligned as before."""
     poses, pictures = room
     mask = np.ones(SIZE_HW, np.bool_)
     mask[:, 100:300] = False
     mask[:, :30] = False  # its border is the seam
     image, _ = pictures["1.png"]
-    whole = align_tracks(poses, pictures.__getitem__)
     masked = align_tracks(poses, {**pictures, "1.png": (image, mask)}.__getitem__)
     column, _ = pixel_from_ray(poses.track_bearings, SIZE_HW).T
     in_masked_image = poses.track_image_idx == 1
     inside = in_masked_image & (((column > 98) & (column < 302)) | (column < 32) | (column > SIZE_HW[1] - 2))
     assert inside.sum() > 100
     assert np.array_equal(masked.track_bearings[inside], poses.track_bearings[inside])
-    changed = np.any(whole.track_bearings != poses.track_bearings, axis=1)
+    changed = np.any(room_aligned.track_bearings != poses.track_bearings, axis=1)
     assert changed[inside].sum() > 20
     far = in_masked_image & (column > 340) & (column < SIZE_HW[1] - 40)
     moved = np.any(masked.track_bearings != poses.track_bearings, axis=1)
     assert moved[far].sum() > 0.5 * changed[far].sum() > 10
 
 
-def test_blocks_change_nothing(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_change_nothing(room: Room, room_aligned: Poses, monkeypatch: pytest.MonkeyPatch) -> None:
     poses, pictures = room
-    whole = align_tracks(poses, pictures.__getitem__)
     monkeypatch.setattr(alignment, "_AT_ONCE", 500)
     parts = align_tracks(poses, pictures.__getitem__)
-    assert whole.track_bearings.tobytes() == parts.track_bearings.tobytes()
-    assert known(whole.track_sigmas_rad).tobytes() == known(parts.track_sigmas_rad).tobytes()
+    assert room_aligned.track_bearings.tobytes() == parts.track_bearings.tobytes()
+    assert known(room_aligned.track_sigmas_rad).tobytes() == known(parts.track_sigmas_rad).tobytes()
 
 
 def test_only_the_longest_tracks_are_aligned_where_there_are_many(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,6 +304,7 @@ def test_a_bundle_refuses_impossible_sigmas(sigmas: NDArray[Any]) -> None:
         replace(bundle, sigmas=sigmas).check()
 
 
+@pytest.mark.slow
 def test_groups_are_aligned_one_by_one(room: Room) -> None:
     poses, pictures = room
     others = {f"b{name}": picture for name, picture in pictures.items()}

@@ -47,6 +47,7 @@ def misplaced(model: PlacedModel) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_the_images_place_a_camera_that_most_matches_put_elsewhere() -> None:
     features, views = room_matches({4: AWAY}, false=200)
     pairs = pairs_of(features, views)
@@ -89,6 +90,7 @@ def pairs_without_common_points() -> tuple[dict[str, Features], dict[tuple[str, 
     return features, views
 
 
+@pytest.mark.slow
 def test_small_range_maps_give_the_lengths_that_no_third_image_does() -> None:
     features, views = pairs_without_common_points()
     pairs = pairs_of(features, {pair: view for pair, view in views.items() if "0.png" in pair})  # no rays to intersect
@@ -119,10 +121,11 @@ def test_an_image_whose_places_nothing_confirms_is_left_out_with_the_reason() ->
     assert "confirm nothing" in refused[4]
 
 
+@pytest.mark.slow
 def test_pictures_without_texture_leave_the_decision_to_the_pairs() -> None:
     features, views = room_matches({4: AWAY})
     pairs = pairs_of(features, views)
-    plain = Confirmation(lambda image: (np.full_like(PICTURES[image], 90), WHOLE))
+    plain = Confirmation(lambda image: (np.full((32, 64, 3), 90, np.uint8), np.ones((32, 64), np.bool_)), width_px=64)
     by_images, _ = model_by_images(pairs, ALL, confirmation=plain, adjust=True)
     by_pairs, _ = grown_model(pairs, ALL, adjust=True)
     assert by_images.cameras.keys() == by_pairs.cameras.keys()

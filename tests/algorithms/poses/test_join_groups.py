@@ -155,7 +155,7 @@ def _errors(poses: Poses, truth: dict[str, Rigid3]) -> tuple[float, float]:
     return max(angles), float(np.linalg.norm(scale * own - other, axis=1).max())
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_rooms_are_joined_by_the_matches_of_all_their_pairs(turned: bool) -> None:
     truth = room_poses(turned=turned)
     features = room_features(truth, door=8, false=60)
@@ -191,6 +191,7 @@ def test_unrelated_places_stay_two_groups() -> None:
     assert len(poses.worlds) == 2
 
 
+@pytest.mark.slow
 def test_rooms_that_fit_in_two_places_stay_two_groups() -> None:
     """Every point behind the door is seen twice: where it is, and where an equal room would have it."""
     truth = room_poses(turned=True)
@@ -411,6 +412,7 @@ def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
     assert height_above_floor(_models(room_features(truth, door=0, own=10), truth, unit=1.0)[0]) == 0
 
 
+@pytest.mark.slow
 def test_no_model_is_lost_where_joined_ones_share_no_pair() -> None:
     """Two pairs of rooms, between which no images were compared."""
     truth = room_poses()

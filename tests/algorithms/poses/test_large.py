@@ -52,6 +52,7 @@ def test_a_walk_is_registered_whole_and_does_not_drift(count: int) -> None:
     assert drift(poses, capture) < 0.002
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_many_draws() -> None:
     """Errors of centres and rotations, divided by their standard deviations, have a mean square of one."""
     centers, rotations = [], []
@@ -272,6 +273,7 @@ def look_alike(capture: PathCapture, views: Views, first: str, second: str) -> V
     return views | {(first, second): replace(template, matches_idx=matches, residuals_rad=np.zeros(count, np.float32))}
 
 
+@pytest.mark.slow
 def test_a_pair_of_places_that_look_alike_is_found(loop: tuple[PathCapture, Views]) -> None:
     capture, views = loop
     (found,) = find_false_closures(capture.features, look_alike(capture, views, "01.jpg", "14.jpg"))

@@ -65,7 +65,7 @@ def test_costs_and_sums_are_those_of_the_whole_volume() -> None:
 
 def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
     poses = capture_poses(2, spread=0.4)
-    pictures = [render(default_room(), pose, (24, 48))[0] for pose in poses]
+    pictures = [render(default_room(), pose, (24, 48), supersample=1)[0] for pose in poses]
     settings = SweepSettings(planes=9, support=1, window=3)
     work = sweep_input(
         pictures[0], pictures[1:], [poses[1] @ poses[0].inverse()], near=NEAR, far=FAR, settings=settings
@@ -91,7 +91,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
 def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range() -> None:
     poses = capture_poses(3, spread=0.4)
     room = default_room()
-    views = [render(room, pose, (96, 192)) for pose in poses]
+    views = [render(room, pose, (96, 192), supersample=1) for pose in poses]
     work = sweep_input(
         views[0][0],
         [view[0] for view in views[1:]],

@@ -89,7 +89,7 @@ SIZE_HW = (96, 192)
 @pytest.fixture(scope="module")
 def capture() -> Capture:
     poses = capture_poses(4, spread=0.4)
-    views = [render(default_room(), pose, SIZE_HW) for pose in poses]
+    views = [render(default_room(), pose, SIZE_HW, supersample=1) for pose in poses]
     return [image for image, _ in views], poses, [truth for _, truth in views]
 
 
@@ -101,9 +101,17 @@ def mean_baseline(poses: Sequence[Rigid3]) -> float:
     return float(np.mean([np.linalg.norm(pose.center - poses[0].center) for pose in poses[1:]]))
 
 
-def test_limits_hold_what_there_is_without_wasting_planes(capture: Capture) -> None:
-    pictures, poses, truth = capture
-    near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+@pytest.fixture(scope="module")
+def capture_limits(capture: Capture) -> tuple[float, float]:
+    pictures, poses, _ = capture
+    return limits_by_sweeping(pictures, poses, masks=no_masks(4))
+
+
+def test_limits_hold_what_there_is_without_wasting_planes(
+    capture: Capture, capture_limits: tuple[float, float]
+) -> None:
+    _, poses, truth = capture
+    near, far = capture_limits
     nearest, farthest = np.nanquantile(truth[0], [0.01, 0.99])
     assert min(nearest / 3, 0.4 * mean_baseline(poses)) < near < nearest
     assert farthest < far < 3 * farthest
@@ -119,10 +127,11 @@ def test_the_near_limit_reaches_a_desk_within_the_baseline(top: Texture) -> None
     assert 0.4 * nearest < near < nearest
 
 
-def test_something_near_is_possible_where_nothing_near_agrees(capture: Capture) -> None:
+def test_something_near_is_possible_where_nothing_near_agrees(
+    capture: Capture, capture_limits: tuple[float, float]
+) -> None:
     """A surface without texture, which no small sweep finds, may still be as near as half a baseline."""
-    pictures, poses, _ = capture
-    assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.5 * mean_baseline(poses)
+    assert capture_limits[0] <= 0.5 * mean_baseline(capture[1])
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +155,7 @@ def test_the_near_limit_reaches_a_plain_table_nearer_than_all_textured_surfaces(
     assert same_far == far
 
 
+@pytest.mark.slow
 def test_the_near_limit_stays_where_lower_ones_do_not_help(table: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Plain pixels that end in the nearest planes of every sweep are there by chance."""
     pictures, poses, _ = table
@@ -164,22 +174,22 @@ def test_the_near_limit_stays_where_lower_ones_do_not_help(table: Capture, monke
     assert tried[-1] == pytest.approx(near / 4)
 
 
-def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
+def test_limits_follow_the_unit_of_length(capture: Capture, capture_limits: tuple[float, float]) -> None:
     pictures, poses, _ = capture
     longer = [Rigid3(pose.rotation, 4 * pose.translation) for pose in poses]
-    near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+    near, far = capture_limits
     assert limits_by_sweeping(pictures, longer, masks=no_masks(4)) == pytest.approx((4 * near, 4 * far))
 
 
-def test_rolling_all_pictures_changes_nothing(capture: Capture) -> None:
+def test_rolling_all_pictures_changes_nothing(capture: Capture, capture_limits: tuple[float, float]) -> None:
     pictures, poses, _ = capture
     rolled = [roll_panorama(picture, 48) for picture in pictures]
     turned = [
         Rigid3(new_from_old @ pose.rotation, new_from_old @ pose.translation)
         for (_, new_from_old), pose in zip(rolled, poses, strict=True)
     ]
-    expected = limits_by_sweeping(pictures, poses, masks=no_masks(4))
-    assert limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4)) == expected
+    found = limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4))
+    assert found == capture_limits
 
 
 def test_pictures_that_agree_on_nothing_get_the_limits_of_the_cameras(capture: Capture) -> None:
@@ -203,7 +213,7 @@ YARD_HW = 96, 192
 @pytest.fixture(scope="module")
 def outdoors() -> tuple[list[NDArray[np.uint8]], tuple[Rigid3, ...], NDArray[np.float32]]:
     scene = courtyard(seed=3, views=3)
-    views = [scene.view(idx, YARD_HW) for idx in range(3)]
+    views = [scene.view(idx, YARD_HW, supersample=1) for idx in range(3)]
     return [picture for picture, _ in views], scene.poses, views[0][1]
 
 
@@ -231,6 +241,7 @@ def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(
     assert far > np.nanmax(truth)
 
 
+@pytest.mark.slow
 def test_the_sky_is_invalid_and_the_court_is_not(
     outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
 ) -> None:
@@ -249,7 +260,7 @@ def test_the_sky_is_invalid_and_the_court_is_not(
 
 def test_no_wall_is_lost_indoors() -> None:
     poses = capture_poses(3, seed=2)
-    views = [render(default_room(2, "weak"), pose, YARD_HW) for pose in poses]
+    views = [render(default_room(2, "weak"), pose, YARD_HW, supersample=1) for pose in poses]
     pictures = [picture for picture, _ in views]
     found = swept_between(pictures, poses, (0.5, 8.0))
     assert found.valid.mean() > 0.999

@@ -127,7 +127,7 @@ def test_same_seed_same_bytes() -> None:
     assert views[0].matches_idx.tobytes() == views[1].matches_idx.tobytes()
 
 
-@pytest.mark.parametrize("count", [40, 150, 600, 3000])
+@pytest.mark.parametrize("count", [40, 150, 600, pytest.param(3000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("crowd", [0.0, 8.0])
 def test_random_matches_have_no_geometry(count: int, crowd: float) -> None:
     """Also where key points crowd at the horizon, which makes chance agreement far more likely."""

@@ -73,7 +73,9 @@ def test_colmap_preset_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: 
     ("solver", "most_deg"),
     [
         (f"{MATCHED}  poses: {{use: poses.colmap, mapper: incremental}}", 0.3),
-        (f"{MATCHED}  poses: {{use: poses.colmap, mapper: global, cameras: faces}}", 0.3),
+        pytest.param(
+            f"{MATCHED}  poses: {{use: poses.colmap, mapper: global, cameras: faces}}", 0.3, marks=pytest.mark.slow
+        ),
         pytest.param("  poses: {use: poses.colmap_sift}", 1, marks=pytest.mark.slow),
     ],
     ids=["incremental", "global", "sift"],

@@ -144,6 +144,7 @@ def test_size_that_is_none_is_refused(toy: Toy) -> None:
     assert "such as" in said
 
 
+@pytest.mark.slow
 def test_workers_keep_the_guard_of_the_run(toy: Toy) -> None:
     """The workers' own guard, of 200 MB, would stop them on a small disk where the run was told to go on."""
     text = 'import pano_mvs.engine.cache.store as s\n    for o in __import__("gc").get_objects():\n'

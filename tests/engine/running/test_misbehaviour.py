@@ -134,7 +134,7 @@ UNCLOSED = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionW
 NEEDS_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="signals, limits and /proc of Linux")
 WAYS = [
     pytest.param(("serial", MISBEHAVIOURS), id="serial", marks=UNCLOSED),
-    pytest.param(("processes", MISBEHAVIOURS), id="processes"),
+    pytest.param(("processes", MISBEHAVIOURS), id="processes", marks=pytest.mark.slow),
     pytest.param(("processes", FATAL), id="processes-fatal", marks=[pytest.mark.slow, NEEDS_LINUX]),
 ]
 Misbehaved = tuple[dict[str, tuple[str, str]], Toy, RunOutput]

@@ -111,7 +111,6 @@ def test_the_stages_of_groups_are_known(tmp_path: Path) -> None:
     reader = WorkflowReader("t", tmp_path, registry, presets=presets_folder())
     text = "pano_mvs: 1\nstages:\n  sweep: {group: sweep"
     made = workflow_schema(registry, *reader.inherited(text + "}", tmp_path / "t.yaml"))
-    jsonschema.Draft202012Validator.check_schema(made)
     assert mistakes(made, text + ", stages: {depth: {planes: 64}}}\n  views: {sources: 2}") == []
     assert mistakes(made, text + ", stages: {depth: {plans: 64}}}")
     assert mistakes(made, text + "}\n  views: {source: 2}")

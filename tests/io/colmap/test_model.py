@@ -126,6 +126,7 @@ def test_poses_without_points_survive(tmp_path: Path) -> None:
     assert len(poses.points_in_world) == len(poses.track_bearings) == 0
 
 
+@pytest.mark.slow
 def test_the_same_poses_are_the_same_bytes_in_another_process(model_folder: Path, tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from tests.io.colmap.test_model import *; "

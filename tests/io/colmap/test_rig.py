@@ -42,6 +42,7 @@ def cuts(layout: FaceLayout = "cube", names: Sequence[str] = NAMES) -> dict[str,
     return {name: CutPanorama(views, [f"{name}_{face.name}.jpg" for face in faces]) for name in names}
 
 
+@pytest.mark.slow
 def test_opencv_is_loaded_before_pycolmap() -> None:
     """The other way round OpenCV's PNG writer frees with pycolmap's zlib what it got from its own, and dies."""
     code = (

@@ -119,6 +119,12 @@ KINDS, FORMS = st.sampled_from(["jpg", "png", "webp", "avif"]), st.sampled_from(
 @given(st.dictionaries(st.sampled_from(FIELDS), TEXTS), KINDS, FORMS)
 @example(full_sphere(10**9, 2 * 10**9), "jpg", "element")
 @example(full_sphere(32, 64, CroppedAreaLeftPixels=10**30), "png", "element")
+@example(
+    {"FullPanoWidthPixels": "64", "FullPanoHeightPixels": "", "ProjectionType": ""}
+    | {"CroppedAreaImageWidthPixels": "", "CroppedAreaImageHeightPixels": "1e308"},
+    "jpg",
+    "element",
+)
 @settings(max_examples=100, deadline=None)
 def test_any_gpano_costs_at_most_its_picture(fields: dict[str, object], kind: str, form: str) -> None:
     """A GPano field of 2·10⁹ columns ended the run of all pictures."""

@@ -25,7 +25,7 @@ def scene_picture(name: str) -> NDArray[np.uint8]:
 
 @pytest.fixture(scope="module")
 def room() -> NDArray[np.uint8]:
-    return render(default_room(), Rigid3.identity(), SIZE)[0]
+    return render(default_room(), Rigid3.identity(), SIZE, supersample=1)[0]
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))

@@ -32,7 +32,7 @@ def confirmation() -> Confirmation:
     return confirmation_of()
 
 
-@pytest.mark.parametrize("image", range(len(POSES)))
+@pytest.mark.parametrize("image", [0, 3])
 def test_a_true_pose_is_confirmed_and_a_moved_one_is_not(confirmation: Confirmation, image: int) -> None:
     true = confirmation.share(image, POSES[image], CAMERAS)
     assert 0.4 < true <= 1
@@ -117,6 +117,7 @@ def test_large_panoramas_are_judged_at_the_same_size(confirmation: Confirmation)
     assert judged.share(0, POSES[0], CAMERAS) == pytest.approx(expected, abs=0.03)
 
 
+@pytest.mark.slow
 def test_maps_that_are_used_again_give_what_fresh_ones_give() -> None:
     three = {idx: CAMERAS[idx] for idx in (0, 1, 2)}
     elsewhere = moved(POSES[0], (0.3, 0.0, 0.0))
@@ -128,6 +129,7 @@ def test_maps_that_are_used_again_give_what_fresh_ones_give() -> None:
         np.testing.assert_array_equal(again.textured, fresh.textured)
 
 
+@pytest.mark.slow
 def test_maps_of_nearly_the_same_poses_are_near_enough() -> None:
     reused = confirmation_of()
     reused.share(0, POSES[0], CAMERAS)

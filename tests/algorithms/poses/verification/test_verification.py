@@ -148,6 +148,7 @@ def test_an_image_without_key_points_takes_nothing_from_the_others(matches: Matc
     assert set(verified(poses_of(TRUTH), (known, two_views)).doubts) <= {NAMES[4]}
 
 
+@pytest.mark.slow
 def test_an_image_of_another_place_is_left_out_with_the_reason(matches: Matches) -> None:
     """Its pairs contradict the others, and no place that they suggest is confirmed."""
     features, two_views = matches
@@ -218,6 +219,7 @@ def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
     assert found.rejected == {}
 
 
+@pytest.mark.slow
 def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
     found = verify_poses(displaced(), lambda name: (np.full((*SIZE_HW, 3), 99, np.uint8), WHOLE))
     assert found.doubts == {}
@@ -225,6 +227,7 @@ def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
     assert np.isnan(found.confirmed_shares).all()
 
 
+@pytest.mark.slow
 def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
     model = model_of(displaced("2.png"), matches)
     before = dict(model.cameras)
