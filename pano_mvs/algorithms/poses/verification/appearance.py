@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -49,7 +48,7 @@ class Surroundings:
         ranges: Callable[[int], NDArray[np.float32] | None],
     ) -> None:
         self._confirmation, self._cameras, self._ranges = confirmation, cameras, ranges
-        self._points = lru_cache(_MAX_CAMERAS)(self._points_of)
+        self._known: dict[int, tuple[FloatArray, NDArray[np.float32]]] = {}
 
     def appearance(self, image: int, pose: Rigid3) -> Appearance:
         """Return how far an image shows at a pose (cam_from_world) what the nearest cameras know.
@@ -77,6 +76,13 @@ class Surroundings:
             float(area[inside].sum() / max(area[textured].sum(), least)),
             float(area[inside & (agreement < 0)].sum() / max(area[inside].sum(), least)),
         )
+
+    def _points(self, image: int) -> tuple[FloatArray, NDArray[np.float32]]:
+        if image not in self._known:
+            if len(self._known) >= _MAX_CAMERAS:
+                del self._known[next(iter(self._known))]
+            self._known[image] = self._points_of(image)
+        return self._known[image]
 
     def _points_of(self, image: int) -> tuple[FloatArray, NDArray[np.float32]]:
         """Return the points that a camera knows, (P, 3), with their colours."""
