@@ -130,11 +130,13 @@ def _with_dropped(stages: list[UnitFound], session: Session, store: Store, *, sw
         out = Path(folder) / "out"
         try:
             run_session(replace(session, out=out, run_options=RunOptions(only=only)), Execution(executor="serial"))
-            for entry in store.runs.entries():
-                if entry.out == str(resolved(out)):
-                    store.runs.forget(entry)
         except (StoreError, UsageError) as error:  # such as of a cache that cannot be written
             Console(stderr=True).say(escape(f"ranges of {shortened_list(dropped, 6)} are missing: {error}"))
+        finally:
+            with suppress(StoreError):
+                for entry in store.runs.entries():
+                    if entry.out == str(resolved(out)):
+                        store.runs.forget(entry)
     return [(unit, record) for unit, record in stages if record is None or not is_missing(record.blobs())]
 
 

@@ -16,6 +16,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import ray_from_pixel
 from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.session.running import run_session as run_whole
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Outcome
 from tests.synthetic.capture_files import write_capture
@@ -303,3 +304,23 @@ def test_a_dropped_result_is_computed_again_for_its_pixel(run: Path, tmp_path: P
     assert len(list(store.runs.each())) == 1, "only that of the run itself is remembered"
     assert call("run", run / "temporary.yaml", *options, "--executor", "serial").code == 0
     assert is_dropped("000.png")
+
+
+def test_an_interrupted_inspection_is_not_remembered_as_a_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = WORKFLOW.replace(
+        "sources: depth}}",
+        "sources: depth}, temporary: true}\n  smooth:  {use: filters.median, in: {range_map: checked}}",
+    )
+    (run / "interrupted.yaml").write_text(text.replace("{ranges: checked}", "{ranges: smooth}"))
+    options = ("--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    assert call("run", run / "interrupted.yaml", *options, "--executor", "serial").code == 0
+
+    def run_session(*arguments: Any, **others: Any) -> None:
+        run_whole(*arguments, **others)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pano_mvs.cli.inspect_command.run_session", run_session)
+    assert call("inspect", tmp_path / "out", "000", 40, 28).code != 0
+    assert len(list(Store(tmp_path / "cache").runs.each())) == 1

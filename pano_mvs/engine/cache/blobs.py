@@ -173,6 +173,8 @@ class BlobStore:
         if (compressed := self._packed(ref)) is not None and compressed.is_compressed:
             return self._decompressed(ref, compressed)
         place = self.verified_place(ref)
+        if isinstance(place, Packed) and (place.is_compressed or ref.suffix not in (ARRAY, JSON)):
+            return self._decompressed(ref, place)  # another process has packed it meanwhile
         try:
             if ref.suffix == ARRAY:
                 if not ref.is_mapped:
@@ -205,6 +207,10 @@ class BlobStore:
                 raise ValueError("not what was stored")
             self._verified.add(ref)
             return _array(data)
+        except StoreError:  # it is damaged, the disk is full, or a run has merged packs meanwhile
+            if self._packed(ref, refresh=True) not in (None, place):
+                return self.get(ref)
+            raise
         except FileNotFoundError as error:
             if self._packed(ref, refresh=True) not in (None, place):  # a run has merged packs meanwhile
                 return self.get(ref)

@@ -21,10 +21,10 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.maintenance import each_record, pack
 from pano_mvs.engine.cache.packs import Packed
-from pano_mvs.engine.cache.store import Store, UnitRecord, is_droppable
+from pano_mvs.engine.cache.store import Store, UnitRecord, is_droppable, record_from_bytes
 
 _NAMED_BLOB = re.compile(rf'\["({IS_DIGEST.pattern})", '.encode())
-_IS_DROPPED = b'"dropped": true'  # in no text of a record, where quotation marks follow a backslash
+_IS_DROPPED = b'"dropped": true'  # or a setting of this name
 
 
 def drop_unneeded(store: Store) -> int:
@@ -102,22 +102,35 @@ def _digests_in_use(store: Store, dropped: Collection[str]) -> set[str]:
     """Return the digests of all blobs that records name, without some and without those that were dropped."""
     digests = set[str]()
     for key, data in each_record(store):  # their bytes are searched, which is several times as fast as reading them
-        if key not in dropped and _IS_DROPPED not in data:
+        if key not in dropped and not _is_dropped(data):
             digests.update(digest.decode() for digest in _NAMED_BLOB.findall(data))
     return digests
 
 
+def _is_dropped(data: bytes) -> bool:
+    """Return whether the bytes of a record say that its result was dropped."""
+    record = record_from_bytes(data) if _IS_DROPPED in data else None
+    return record is not None and record.dropped
+
+
 def _delete(store: Store, blobs: Iterable[BlobRef]) -> int:
-    size_bytes, packed = 0, list[Packed]()
-    for ref in blobs:
-        place = store.blobs.forget(ref)
-        if isinstance(place, Packed):
-            packed.append(place)
-            size_bytes += place.size_bytes
-        else:
-            with suppress(OSError):  # Windows keeps a file that is mapped; garbage collection removes it
-                place.unlink(missing_ok=True)
+    """Delete blobs, also those that are in a file and in packs, and return their size in bytes."""
+    size_bytes, packs = 0, set[Path]()
+    waiting = list(blobs)
+    while waiting:
+        packed = list[Packed]()
+        for ref in waiting:
+            place = store.blobs.forget(ref)
+            if isinstance(place, Packed):
+                packed.append(place)
+                size_bytes += place.size_bytes
+            path = store.blobs.path(ref)
+            with suppress(OSError):  # missing, or mapped on Windows; garbage collection removes it
+                path.unlink()
                 size_bytes += ref.size_bytes
-    store.blobs.packs.forget(packed)
-    store.blobs.packs.rewrite({place.pack for place in packed})
+        store.blobs.packs.forget(packed)
+        packs |= {place.pack for place in packed}
+        again = {place.digest for place in packed}
+        waiting = [ref for ref in waiting if ref.digest in again and store.blobs.exists(ref)]
+    store.blobs.packs.rewrite(packs)
     return size_bytes

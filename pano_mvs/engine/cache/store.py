@@ -31,6 +31,7 @@ from pano_mvs.core.files import (
     checked_body,
     clear_abandoned,
     is_full_disk,
+    is_older,
     make_folder,
     make_room,
     read_regular,
@@ -270,18 +271,22 @@ class Store:
 
     def put(self, record: UnitRecord) -> None:
         """Write a record; its blobs must already exist."""
-        if (packed := self.packed_record(record.key)) is not None:  # it could not be used
-            self.blobs.packs.forget([packed])
+        self._forget_packed([record.key])  # it could not be used
         self._write(record)
 
     def replace(self, records: Iterable[UnitRecord]) -> None:
         """Write records in place of those that have their keys; others see the old or the new ones meanwhile."""
-        packed = list[Packed]()
+        keys = list[str]()
         for record in records:
             self._write(record)
-            if (old := self.packed_record(record.key)) is not None:
-                packed.append(old)
-        self.blobs.packs.forget(packed)
+            keys.append(record.key)
+        self._forget_packed(keys)
+
+    def _forget_packed(self, keys: Iterable[str]) -> None:
+        """Take records out of all packs that have them: caches that were copied into one another have some twice."""
+        while packed := [found for key in keys if (found := self.packed_record(key)) is not None]:
+            self.blobs.packs.forget(packed)
+            keys = [found.digest for found in packed]
 
     def _write(self, record: UnitRecord) -> None:
         body = json.dumps(record.to_json(), sort_keys=True).encode()
@@ -293,8 +298,7 @@ class Store:
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be unusable."""
-        if (packed := self.packed_record(key)) is not None:
-            self.blobs.packs.forget([packed])
+        self._forget_packed([key])
         path = self.record_path(key)
         if not is_link(path.parent):
             make_room(path)
@@ -356,6 +360,11 @@ class Store:
         finally:
             with suppress(OSError):
                 mark.unlink(missing_ok=True)
+
+    def abandoned_mark(self) -> Path | None:
+        """Return the mark of a run that may use the cache for more than a day, or has been killed elsewhere, if any."""
+        marks = children(self.blobs.temporary, f"*-{_RUN_MARK}*")
+        return next((path for path in marks if is_older(path, 24 * 3600.0)), None)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:

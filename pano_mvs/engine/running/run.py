@@ -245,8 +245,13 @@ class Run:
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
         if unneeded and self._pass.stored.has_undropped:
-            if not self.is_alone():
-                return  # the run that ends last drops and packs
+            if not self.is_alone():  # the run that ends last drops and packs
+                if (mark := self.store.abandoned_mark()) is not None:
+                    self.warn(
+                        "the results of temporary stages stay in the cache, since another run may use it. If no other "
+                        f"one does, delete {mark}, which a killed run has left on another computer, and run again"
+                    )
+                return
             try:
                 drop_unneeded(self.store)
             except StoreError as error:

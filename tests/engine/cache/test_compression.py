@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.engine.cache import compression, maintenance, packs
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.compression import Shuffle, compress, decompress, decompressed_chunks, shuffle_of_file
@@ -284,3 +284,45 @@ def test_a_cache_of_the_layout_before_is_read_and_says_when_it_is_no_longer_that
     (tmp_path / "layout.json").write_text(json.dumps({"layout": LAYOUT_VERSION + 1}))
     with pytest.raises(UsageError, match="has layout"):
         Store(tmp_path)
+
+
+def test_a_full_disk_loses_no_packed_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, file = Store(tmp_path / "cache"), tmp_path / "a.bin"
+    file.write_bytes(bytes(200_000))
+    ref = store.blobs.put(FilePart(file))
+    assert pack(store)
+
+    def full(*_: object, **__: object) -> None:
+        raise StoreError("cannot be written. Free some space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(store.blobs), "_writing", full)
+        with pytest.raises(StoreError, match="Free some space") as caught:
+            store.blobs.get(ref)
+    assert not isinstance(caught.value, DamagedBlobError)
+    found = store.blobs.get(ref)
+    assert isinstance(found, FilePart)
+    assert found.path.read_bytes() == bytes(200_000)
+
+
+@pytest.mark.parametrize("is_array", [True, False])
+def test_a_value_that_another_process_packs_while_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_array: bool
+) -> None:
+    store, file = Store(tmp_path / "cache"), tmp_path / "a.bin"
+    file.write_bytes(bytes(200_000))
+    ref = store.blobs.put(RANGES if is_array else FilePart(file))
+    verified = store.blobs.verified_place
+
+    def packed_before(ref: BlobRef) -> Path | Packed:
+        monkeypatch.undo()
+        monkeypatch.setattr(maintenance, "_MIN_PACKED_FILES", 1)
+        assert pack(Store(tmp_path / "cache"))
+        return verified(ref)
+
+    monkeypatch.setattr(store.blobs, "verified_place", packed_before)
+    found = store.blobs.get(ref)
+    if isinstance(found, FilePart):
+        assert found.path.read_bytes() == bytes(200_000)
+    else:
+        np.testing.assert_array_equal(found, RANGES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.engine.cache import dropping
 from pano_mvs.engine.cache.dropping import dropping_after
 from pano_mvs.engine.cache.maintenance import collect, pack, usage_of, verify
+from pano_mvs.engine.cache.packs import Packed
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import ExecutorRequest, SerialExecutor, make_executor
 from pano_mvs.engine.executors.protocol import JobOutcome
@@ -419,3 +421,45 @@ def test_a_second_run_reads_no_other_record(rows: Rows, monkeypatch: pytest.Monk
     rows.run()
     monkeypatch.setattr(dropping, "each_record", lambda _: pytest.fail("all records were read"))
     assert rows.run().computed == 0
+
+
+def test_the_mark_of_a_run_that_was_killed_elsewhere_is_named(rows: Rows) -> None:
+    rows.run("last.value=5")
+    mark = rows.store.root / "tmp" / ".tmp-deadbeef-4711-run-0123456789abcdef"
+    mark.touch()
+    os.utime(mark, (0, time.time() - 2 * 24 * 3600))
+    result = rows.run("first.value=7")
+    assert rows.has("first")
+    assert any(f"delete {mark}" in warning for warning in result.warnings), result.warnings
+    mark.unlink()
+    assert rows.run("first.value=700").warnings == []
+    assert rows.kept() == KEPT
+
+
+def test_a_setting_named_dropped_drops_nothing(rows: Rows) -> None:
+    rows.run()
+    record = rows.records("last")[0]
+    named = replace(record, identity={**record.identity, "params": {"dropped": True}})
+    rows.store.replace([named])
+    shared = {ref.digest for ref in named.blobs()}
+    assert shared <= dropping._digests_in_use(rows.store, ())
+
+
+def test_values_that_are_packed_twice_are_dropped_in_both_packs(rows: Rows, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pano_mvs.engine.cache.maintenance._MIN_PACKED_FILES", 1)
+    rows.run(options=RunOptions(keep_all=True))
+    store = rows.store
+    record = rows.records("first")[0]
+    pack(store)
+    for value in record.own_blobs():
+        place = store.blobs.place(value)
+        assert isinstance(place, Packed)
+        store.blobs.packs.add([(place, None)])
+    packed = store.packed_record(record.key)
+    assert packed is not None
+    store.blobs.packs.add([(packed, None)])
+    assert dropping._drop(store, {record.key})
+    assert not any(store.blobs.exists(ref) for ref in record.blobs() if ref.suffix != ".json")
+    again = store.read_record(record.key)
+    assert again is not None
+    assert again.dropped
