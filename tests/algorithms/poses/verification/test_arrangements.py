@@ -80,9 +80,9 @@ def test_the_images_refute_the_place_that_most_matches_suggest() -> None:
     """A refuted place is no rival: right cameras of repeating places were doubted because of such."""
     features, two_views = room_matches({2: AWAY}, false=120)
     model = PlacedModel(pairs_of(features, two_views)).with_cameras(dict(enumerate(POSES)))
-    careful = {"miss_cost": 1000.0}  # doubts all cameras, so that their other places are compared
-    _, checks = correct_cameras(model, confirmation(), **careful)
-    _, reported = correct_cameras(model, confirmation(), fixed=range(len(POSES)), **careful)
+    miss_cost = 1000.0  # doubts all cameras, so that their other places are compared
+    _, checks = correct_cameras(model, confirmation(), miss_cost=miss_cost)
+    _, reported = correct_cameras(model, confirmation(), fixed=range(len(POSES)), miss_cost=miss_cost)
     assert reported.evidence[2]["place_rival"] > 0
     assert checks.evidence[2]["place_rival"] == 0
     assert checks.p_right[2] > reported.p_right[2]
