@@ -207,10 +207,12 @@ class BlobStore:
                 raise ValueError("not what was stored")
             self._verified.add(ref)
             return _array(data)
-        except StoreError:  # it is damaged, the disk is full, or a run has merged packs meanwhile
+        except StoreError as error:  # it is damaged, the disk is full, or a run has merged packs meanwhile
             if self._packed(ref, refresh=True) not in (None, place):
                 return self.get(ref)
-            raise
+            if isinstance(error, DamagedBlobError) or self.exists(ref):
+                raise
+            raise self.discard(ref, "is gone") from None  # garbage collection has deleted it meanwhile
         except FileNotFoundError as error:
             if self._packed(ref, refresh=True) not in (None, place):  # a run has merged packs meanwhile
                 return self.get(ref)

@@ -116,12 +116,12 @@ def _is_dropped(data: bytes) -> bool:
 def _delete(store: Store, blobs: Iterable[BlobRef]) -> int:
     """Delete blobs, also those that are in a file and in packs, and return their size in bytes."""
     size_bytes, packs = 0, set[Path]()
-    waiting = list(blobs)
+    waiting, tried = list(blobs), set[Packed]()  # a pack that is missing keeps its index
     while waiting:
         packed = list[Packed]()
         for ref in waiting:
             place = store.blobs.forget(ref)
-            if isinstance(place, Packed):
+            if isinstance(place, Packed) and place not in tried:
                 packed.append(place)
                 size_bytes += place.size_bytes
             path = store.blobs.path(ref)
@@ -130,6 +130,7 @@ def _delete(store: Store, blobs: Iterable[BlobRef]) -> int:
                 size_bytes += ref.size_bytes
         store.blobs.packs.forget(packed)
         packs |= {place.pack for place in packed}
+        tried.update(packed)
         again = {place.digest for place in packed}
         waiting = [ref for ref in waiting if ref.digest in again and store.blobs.exists(ref)]
     store.blobs.packs.rewrite(packs)

@@ -284,8 +284,10 @@ class Store:
 
     def _forget_packed(self, keys: Iterable[str]) -> None:
         """Take records out of all packs that have them: caches that were copied into one another have some twice."""
-        while packed := [found for key in keys if (found := self.packed_record(key)) is not None]:
+        tried = set[Packed]()  # a pack that is missing keeps its index
+        while packed := {found for key in keys if (found := self.packed_record(key)) is not None} - tried:
             self.blobs.packs.forget(packed)
+            tried |= packed
             keys = [found.digest for found in packed]
 
     def _write(self, record: UnitRecord) -> None:

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.engine.cache import compression, maintenance, packs
-from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.cache import compression, dropping, maintenance, packs
+from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.compression import Shuffle, compress, decompress, decompressed_chunks, shuffle_of_file
 from pano_mvs.engine.cache.maintenance import collect, pack, usage_of, verify
 from pano_mvs.engine.cache.packs import Packed
-from pano_mvs.engine.cache.store import LAYOUT_VERSION, Store
+from pano_mvs.engine.cache.store import LAYOUT_VERSION, ItemRef, Store, UnitRecord
 from pano_mvs.scene import FilePart
 
 RANGES = (np.round(64 * (1 + np.hypot(*np.mgrid[:300, :400] / 50))) / 64).astype(np.float32)
@@ -303,6 +303,38 @@ def test_a_full_disk_loses_no_packed_file(tmp_path: Path, monkeypatch: pytest.Mo
     found = store.blobs.get(ref)
     assert isinstance(found, FilePart)
     assert found.path.read_bytes() == bytes(200_000)
+
+
+def test_a_file_whose_pack_is_collected_while_it_is_read_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, file = Store(tmp_path / "cache"), tmp_path / "a.bin"
+    file.write_bytes(bytes(200_000))
+    ref = store.blobs.put(FilePart(file))
+    assert pack(store)
+
+    def collected(packed: Packed, _: object) -> None:
+        store.blobs.packs.remove(packed.pack)
+        raise FileNotFoundError(packed.pack)
+
+    monkeypatch.setattr(Packed, "write_to", collected)
+    with pytest.raises(DamagedBlobError, match="is gone"):
+        store.blobs.get(ref)
+
+
+def test_records_and_blobs_of_a_pack_that_was_deleted_by_hand(tmp_path: Path) -> None:
+    """Regression: its index stayed, so that writing its record again did not end."""
+    store = Store(tmp_path / "cache")
+    part = store.blobs.put(RANGES)
+    record = UnitRecord("ab" * 16, {}, ItemRef("K", "d" * 32, PackedRefs({"values": part})))
+    store.put(record)
+    assert pack(store)
+    for path in store.blobs.packs.folder.glob("*.pack"):
+        path.unlink()
+    again = Store(tmp_path / "cache")
+    again.put(record)
+    assert again.packed_record(record.key) is not None
+    dropping._delete(again, list(record.blobs()))
 
 
 @pytest.mark.parametrize("is_array", [True, False])

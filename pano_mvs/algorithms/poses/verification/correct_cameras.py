@@ -133,8 +133,7 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
     """Compare the confirmed share of each image with the share that its nearest neighbours suggest.
 
     Each image is also compared with what the others expect of it. In larger captures the images share their small
-    sweeps. Images whose result is then less than perfect are judged
-    again by sweeps of their neighbours without them.
+    sweeps. Images whose result is then less than perfect are judged again by sweeps of their neighbours without them.
     """
     # The first pass uses shared sweeps; a second one follows below this expected share.
     shared = len(model.cameras) >= SHARED_FROM

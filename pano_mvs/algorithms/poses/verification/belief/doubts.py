@@ -40,8 +40,8 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
     ),
     "likeness": (
         lambda row: (
-            f"what it shows is correlated by {-row['likeness']:.2f} less with what other images lead to expect there "
-            "than in the mean of the other cameras"
+            f"what it shows is correlated by {max(-row['likeness'], 0.0):.2f} less with what other images lead "
+            "to expect there than in the mean of the other cameras"
         ),
         "",
         _CLOSER,
