@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.algorithms.learned.lightglue import match_learned
+from pano_mvs.algorithms.learned.lightglue import learned_matches, match_learned
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.two_view.learned_pairs import is_settled
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.api import All, Context, Features, Near, Params, TwoView, TwoViews, arguments_from, params_from, stage
 from pano_mvs.stages.features import NetworkParams
@@ -36,13 +37,18 @@ class LightGlueParams(NetworkParams):
 def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -> TwoView:
     """Match the key points of features.aliked by the network LightGlue, then verify the matches by spherical RANSAC.
 
-    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors.
-    Key points of an earlier stage of features are matched as in matches.brute_force, and verified together with these.
+    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors. If
+    the first three of these settle whether the images show the same, there are no others. Key points of an earlier
+    stage of features are matched as in matches.brute_force, and verified together with these.
     """
     first, second = features
-    learned = match_learned(first, second, networks=params.networks, **arguments_from(match_learned, params))
-    candidates = np.concatenate([match_features(first.without_learned(), second.without_learned()), learned])
-    two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
+    found = match_features(first.without_learned(), second.without_learned())
+    settings = arguments_from(match_learned, params)
+    for learned in learned_matches(first, second, networks=params.networks, **settings):
+        candidates = np.concatenate([found, learned])
+        two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
+        if is_settled(two_view):
+            break
     _report_pair(two_view, len(candidates), ctx)
     return two_view
 

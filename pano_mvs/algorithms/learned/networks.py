@@ -33,9 +33,11 @@ DIGESTS: Mapping[str, str] = {
     "aliked_detector.onnx": "e87fa9dee348f3a65f23a02437ad70ea2cc9892fa03acc859069bd749c2d756e",
     "aliked_descriptor.onnx": "5e82ee63a520132462eb6fefc3eb981d005778e94aca378694044c94529e1605",
     "lightglue_start.onnx": "b46f3cba24b9203f1414eb57be9132b30371ded81b9b4934ad8030eb2b2018ed",
-    "lightglue_layer.onnx": "9f7d6bbbbb25548d0cff9a0a3628217ea29d589356dfa168aa51c19ebaf5ce6d",
+    "lightglue_layer.onnx": "ee9cd47d69196a64b6c0a6e97b86554f41152b3def8a3b20ef3101a7c1207c18",
     "lightglue_end.onnx": "012271bd4a563195958c1fa02761e311b080ae6e5b2c787bcce9efb4e30fd920",
 }
+# Graphics cards do not multiply whole numbers as processors do. A folder of one's own has one file for both.
+_FLOAT_LAYER = ("lightglue_layer_float.onnx", "d35e52b2eabb115c0371c72502f2c2b122cbb194579811ed24c53f4ad16ef8aa")
 _PACKAGED = Path(__file__).parent / "models"
 # Files of COLMAP 4 are recognised by the names and axes of their inputs and outputs, whatever they are called.
 _COLMAP: Mapping[Literal["extractor", "matcher"], str] = {
@@ -128,7 +130,10 @@ class Networks:
 
     def _path(self, file: str) -> Path:
         if self.models is None:
-            return _checked(_PACKAGED / file, DIGESTS[file])
+            digest = DIGESTS[file]
+            if file == "lightglue_layer.onnx" and self.provider != "cpu":
+                file, digest = _FLOAT_LAYER
+            return _checked(_PACKAGED / file, digest)
         path = self.models / file
         if not is_file(path):
             own = [name for name in DIGESTS if is_file(self.models / name)]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.learned import aliked, networks
 from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles, maxima_of_scores
 from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
-from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
+from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks, Provider
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features
@@ -66,8 +66,17 @@ def test_key_points_and_descriptors_are_those_of_pytorch(by_torch: Mapping[str, 
     assert np.quantile(cosines, 0.05) > 0.98
 
 
-def test_matches_are_those_of_pytorch(by_torch: Mapping[str, Any]) -> None:
-    """PyTorch ran all layers without dropping key points; stopping early loses few matches."""
+@pytest.mark.parametrize("provider", ["cpu", "cuda"])
+def test_matches_are_those_of_pytorch(
+    by_torch: Mapping[str, Any], provider: Provider, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PyTorch ran all layers without dropping key points; stopping early loses few matches.
+
+    A processor also computes what is meant for graphics cards.
+    """
+    monkeypatch.setattr(networks, "_PROVIDERS", dict.fromkeys(("cpu", "cuda"), "CPUExecutionProvider"))
+    theirs = Networks(provider=provider)
+    layer = theirs.load("lightglue_layer.onnx")
     seen = []
     for number in (0, 1):
         image = (by_torch[f"picture{number}"].astype(np.float32) / 255).transpose(2, 0, 1)[None]
@@ -76,13 +85,14 @@ def test_matches_are_those_of_pytorch(by_torch: Mapping[str, Any]) -> None:
         named = {f"features{level}": one for level, one in enumerate(maps)}
         descriptors = PACKAGED.load("aliked_descriptor.onnx")(**named, pixels=pixels)[0]
         seen.append((descriptors, (pixels / (TILE_PX / 2) - 1).astype(np.float32)))
-    matches, scores = LightGlue(PACKAGED).match(seen[0], seen[1], min_score=0.1)
-    ours, theirs = {(int(i), int(j)) for i, j in matches}, {(int(i), int(j)) for i, j in by_torch["matches"]}
-    assert len(ours & theirs) > 0.9 * len(theirs)
-    assert len(ours - theirs) < 0.1 * len(theirs)
+    matches, scores = LightGlue(theirs).match(seen[0], seen[1], min_score=0.1)
+    ours, expected = {(int(i), int(j)) for i, j in matches}, {(int(i), int(j)) for i, j in by_torch["matches"]}
+    assert len(ours & expected) > 0.9 * len(expected)
+    assert len(ours - expected) < 0.1 * len(expected)
     assert scores.min() > 0.1
     nothing = np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
-    assert len(LightGlue(PACKAGED).match(nothing, seen[1], min_score=0.1)[0]) == 0
+    assert len(LightGlue(theirs).match(nothing, seen[1], min_score=0.1)[0]) == 0
+    assert layer.interface == PACKAGED.load("lightglue_layer.onnx").interface
 
 
 def test_level_tiles_cover_the_horizon_and_follow_the_zenith() -> None:

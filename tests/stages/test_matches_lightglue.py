@@ -1,0 +1,100 @@
+"""matches.lightglue compares only as many pairs of views as tell whether two images show the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.learned.lightglue import LightGlue, Side, match_learned
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, Array
+from pano_mvs.algorithms.two_view.learned_pairs import CERTAIN, is_settled
+from pano_mvs.api import Context
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import rotation_from_rotvec
+from pano_mvs.scene import Features, TwoView
+from pano_mvs.stages.matches import LightGlueParams, lightglue
+from tests.algorithms.poses.synthetic_capture import features_from_bearings
+
+
+def seen(points: FloatArray, descriptors: NDArray[np.float32]) -> Features:
+    """Learned key points of a level camera at the origin, whose scores fall from one to the next."""
+    bearings = points / np.linalg.norm(points, axis=1, keepdims=True)
+    count = len(points)
+    features = replace(
+        features_from_bearings(bearings),
+        descriptors=np.rint(DESCRIPTOR_NORM * descriptors).astype(np.float32),
+        scores=np.linspace(1, 0.1, count, dtype=np.float32),
+        learned=count,
+        ups=((0.0, -1.0, 0.0),),
+        per_up=(count,),
+    )
+    features.check()
+    return features
+
+
+def pair(true: int, false: int) -> tuple[Features, Features]:
+    """Two images with some points in common and others that are in one image only."""
+    rng = np.random.default_rng(3)
+    azimuth, height, distance = (rng.uniform(*ends, true + false) for ends in ((-3.0, 3.0), (-0.5, 0.4), (2.0, 8.0)))
+    points = np.stack([np.sin(azimuth), height, np.cos(azimuth)], axis=1) * distance[:, None]
+    descriptors = rng.normal(size=(len(points), 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    moved = (points - [0.6, 0.0, 0.3]) @ rotation_from_rotvec([0.0, 0.2, 0.0]).T
+    moved[true:] = rng.permutation(moved[true:])
+    return seen(points, descriptors), seen(moved, descriptors)
+
+
+@pytest.fixture
+def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """The numbers of key points of the views that are compared: equal descriptors match."""
+    found: list[tuple[int, int]] = []
+
+    def match(
+        self: LightGlue, first: Sequence[Array], second: Sequence[Array], *, min_score: float
+    ) -> tuple[NDArray[np.intp], Array]:
+        found.append((len(first[0]), len(second[0])))
+        matched = np.argwhere(first[0] @ second[0].T > 0.99)
+        return matched, np.ones(len(matched), np.float32)
+
+    monkeypatch.setattr(LightGlue, "match", match)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("true", "false", "views"),
+    [(900, 0, 3), (120, 300, 8), (0, 900, 3), (0, 0, 0)],
+    ids=["certain", "unsure", "nothing in common", "no key points"],
+)
+def test_further_views_are_compared_only_if_the_first_do_not_settle_the_pair(
+    compared: list[tuple[int, int]], tmp_path: Path, true: int, false: int, views: int
+) -> None:
+    found = lightglue(pair(true, false), LightGlueParams(), Context(np.random.default_rng(0), tmp_path))
+    assert len(compared) == views
+    assert bool(found) == (true > 0)
+    assert found.candidates >= len(found.matches_idx)
+
+
+def test_only_the_strongest_key_points_of_a_view_are_compared(compared: list[tuple[int, int]]) -> None:
+    first, second = pair(3000, 0)
+    all_of_them = match_learned(first, second, max_view_keypoints=3000)
+    assert max(max(counts) for counts in compared) > 300
+    compared.clear()
+    few = match_learned(first, second, max_view_keypoints=40)
+    assert {*compared} == {(40, 40)}
+    assert 40 < len(few) < len(all_of_them)
+    idx, *_ = Side.of(first).inside(2, 40)
+    everything, *_ = Side.of(first).inside(2)
+    assert idx.tolist() == everything[:40].tolist(), "scores fall from one key point to the next"
+
+
+def test_a_pair_is_settled_if_it_is_certain_or_shows_no_sign_of_a_geometry() -> None:
+    failed = TwoView.failed("chance")
+    assert is_settled(failed)
+    assert is_settled(replace(failed, log10_false_alarms=-4.0))
+    assert not is_settled(replace(failed, log10_false_alarms=-12.0))
+    assert is_settled(replace(failed, log10_false_alarms=CERTAIN))
