@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.algorithms.learned.lightglue import learned_matches, match_learned
+from pano_mvs.algorithms.learned.lightglue import few_and_all_matches, match_learned
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.learned_pairs import is_settled
 from pano_mvs.algorithms.two_view.verification import verify_pair
@@ -37,14 +37,15 @@ class LightGlueParams(NetworkParams):
 def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -> TwoView:
     """Match the key points of features.aliked by the network LightGlue, then verify the matches by spherical RANSAC.
 
-    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors. If
-    the first three of these settle whether the images show the same, there are no others. Key points of an earlier
-    stage of features are matched as in matches.brute_force, and verified together with these.
+    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors:
+    the strongest ones of the first three pairs, then, unless these settle whether the images show the same, all of
+    them. Key points of an earlier stage of features are matched as in matches.brute_force, and verified together with
+    these.
     """
     first, second = features
     found = match_features(first.without_learned(), second.without_learned())
     settings = arguments_from(match_learned, params)
-    for learned in learned_matches(first, second, networks=params.networks, **settings):
+    for learned in few_and_all_matches(first, second, networks=params.networks, **settings):
         candidates = np.concatenate([found, learned])
         two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
         if is_settled(two_view):

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.learned.lightglue import LightGlue, Side, match_learned
+from pano_mvs.algorithms.learned.lightglue import LightGlue, Side, few_and_all_matches, match_learned
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, Array
-from pano_mvs.algorithms.two_view.learned_pairs import CERTAIN, is_settled
+from pano_mvs.algorithms.two_view.learned_pairs import is_settled
 from pano_mvs.api import Context
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.stages.matches import LightGlueParams, lightglue
+from pano_mvs.testing.tiny_capture import tiny_capture
 from tests.algorithms.poses.synthetic_capture import features_from_bearings
 
 
@@ -67,34 +68,35 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize(
     ("true", "false", "views"),
-    [(900, 0, 3), (120, 300, 8), (0, 900, 3), (0, 0, 0)],
-    ids=["certain", "unsure", "nothing in common", "no key points"],
+    [(900, 0, 3), (90, 300, 11), (0, 900, 3), (0, 0, 0)],
+    ids=["clear", "unsure", "nothing in common", "no key points"],
 )
-def test_further_views_are_compared_only_if_the_first_do_not_settle_the_pair(
+def test_all_views_are_compared_only_if_the_first_do_not_settle_the_pair(
     compared: list[tuple[int, int]], tmp_path: Path, true: int, false: int, views: int
 ) -> None:
     found = lightglue(pair(true, false), LightGlueParams(), Context(np.random.default_rng(0), tmp_path))
     assert len(compared) == views
-    assert bool(found) == (true > 0)
-    assert found.candidates >= len(found.matches_idx)
+    assert bool(found) == (true == 900)
 
 
-def test_only_the_strongest_key_points_of_a_view_are_compared(compared: list[tuple[int, int]]) -> None:
-    first, second = pair(3000, 0)
-    all_of_them = match_learned(first, second, max_view_keypoints=3000)
-    assert max(max(counts) for counts in compared) > 300
-    compared.clear()
-    few = match_learned(first, second, max_view_keypoints=40)
-    assert {*compared} == {(40, 40)}
-    assert 40 < len(few) < len(all_of_them)
-    idx, *_ = Side.of(first).inside(2, 40)
-    everything, *_ = Side.of(first).inside(2)
-    assert idx.tolist() == everything[:40].tolist(), "scores fall from one key point to the next"
+def test_the_first_views_are_compared_by_their_strongest_key_points(compared: list[tuple[int, int]]) -> None:
+    first, second = pair(6000, 0)
+    few, everything = few_and_all_matches(first, second, min_score=0.1, max_views=8)
+    assert {*compared[:3]} == {(512, 512)}
+    assert len(compared) == 3 + 8
+    assert min(min(counts) for counts in compared[3:]) > 512
+    assert 512 < len(few) < len(everything)
+    assert np.array_equal(everything, match_learned(first, second))
+    strongest, *_ = Side.of(first).inside(2, 40)
+    inside, *_ = Side.of(first).inside(2)
+    assert strongest.tolist() == inside[:40].tolist(), "scores fall from one key point to the next"
 
 
-def test_a_pair_is_settled_if_it_is_certain_or_shows_no_sign_of_a_geometry() -> None:
+def test_a_pair_is_settled_if_it_is_clear_or_shows_no_sign_of_a_geometry() -> None:
     failed = TwoView.failed("chance")
     assert is_settled(failed)
     assert is_settled(replace(failed, log10_false_alarms=-4.0))
     assert not is_settled(replace(failed, log10_false_alarms=-12.0))
-    assert is_settled(replace(failed, log10_false_alarms=CERTAIN))
+    verified = next(iter(tiny_capture().each(TwoView).values()))
+    assert is_settled(replace(verified, log10_false_alarms=-120.0))
+    assert not is_settled(replace(verified, log10_false_alarms=-80.0))

@@ -10,6 +10,7 @@ upside_down.py` fits to captures that are upright.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import (
     up_from_lines,
 )
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import UP, ray_grid, rotate_panorama, rotation_from_two_vectors
+from pano_mvs.geometry import UP, pixel_from_ray, ray_grid, rotation_from_two_vectors, sample_panorama
 from pano_mvs.scene import Poses
 
 _SIZE_HW = (256, 512)
@@ -139,17 +140,35 @@ def _reduced(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[NDArra
 def _in_picture(small: NDArray[np.uint8], mask: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
     """Return the differences of brightness and texture, (2,); 0 where too little is valid both below and above."""
     turn = rotation_from_two_vectors(up_in_cam, UP)
-    level = rotate_panorama(small, turn)
-    is_valid = rotate_panorama(mask, turn) > 254
-    # Logarithms of noise in black and of grain in plain surfaces say nothing.
-    brightness = np.log(level.mean(axis=2) / 255 + 0.05)
-    cosine = np.hypot(*np.moveaxis(ray_grid(_SIZE_HW)[..., ::2], -1, 0))
-    across = (np.roll(brightness, -1, axis=1) - np.roll(brightness, 1, axis=1)) / cosine
-    texture = np.log(np.hypot(across, 2 * np.gradient(brightness, axis=0)) + 0.01)
-    weights = cosine * ((cosine < np.cos(np.radians(_BAND_DEG[0]))) & (cosine > np.cos(np.radians(_BAND_DEG[1]))))
-    weights[_SIZE_HW[0] // 2 :] = 0
-    own = weights * (is_valid & is_valid[::-1])
+    rows, weights = _band()
+    picture = np.dstack([small, mask])
+
+    def strip(of_rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Return brightness, texture and what is valid in some rows, without the first and the last one."""
+        pixels = pixel_from_ray(ray_grid(_SIZE_HW)[of_rows] @ turn, _SIZE_HW)
+        level = np.rint(sample_panorama(picture, pixels))
+        # Logarithms of noise in black and of grain in plain surfaces say nothing.
+        brightness = np.log(level[..., :3].mean(axis=2) / 255 + 0.05)
+        across = (np.roll(brightness, -1, axis=1) - np.roll(brightness, 1, axis=1))[1:-1] / weights
+        texture = np.log(np.hypot(across, brightness[2:] - brightness[:-2]) + 0.01)
+        return brightness[1:-1], texture, level[1:-1, :, 3] > 254
+
+    *above, valid_above = strip(rows)
+    *below, valid_below = strip(_SIZE_HW[0] - 1 - rows)
+    own = weights * (valid_above & valid_below)
     # Share of the compared directions that must not be masked.
-    if own.sum() < 0.1 * weights.sum():
+    if own.sum() < 0.1 * _SIZE_HW[1] * weights.sum():
         return np.zeros(2)
-    return np.array([((part[::-1] - part) * own).sum() / own.sum() for part in (brightness, texture)])
+    return np.array([((low - high) * own).sum() / own.sum() for low, high in zip(below, above, strict=True)])
+
+
+@cache
+def _band() -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the rows above the horizon that are compared, and one more on either side, with the cosines of the former.
+
+    The cosines of their elevations are (N, 1).
+    """
+    cosine = np.hypot(*np.moveaxis(ray_grid(_SIZE_HW)[: _SIZE_HW[0] // 2, 0, ::2], -1, 0))
+    low, high = np.cos(np.radians(_BAND_DEG))
+    inside = np.flatnonzero((cosine < low) & (cosine > high))
+    return np.arange(inside[0] - 1, inside[-1] + 2), cosine[inside, None]
