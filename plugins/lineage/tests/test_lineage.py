@@ -19,6 +19,7 @@ from pano_mvs_lineage.why import repeat, why
 import pano_mvs as package
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.results.origin import Origin, RunName
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
@@ -278,6 +279,61 @@ def test_a_file_leads_back_to_its_unit_and_to_the_images(two: tuple[Toy, Path, P
     assert repeat(origin).is_same
     (first / name).write_bytes(b"changed")
     assert why(first / name).was_changed
+
+
+def test_a_file_that_was_renamed_in_its_folder_is_found_by_its_content(two: tuple[Toy, Path, Path]) -> None:
+    """It was refused, as a file that the run has not written."""
+    _, first, _ = two
+    name = next(iter(package.load(first).summary.files))
+    renamed = (first / name).rename(first / "mine.txt")
+    assert (why(renamed).name, why(renamed).units) == (name, why(shutil.copy(renamed, first / name)).units)
+
+
+def test_copies_of_what_no_unit_made_are_found_by_their_content(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """Only files that units made were found: not the report, run.json, the events, or a page that somebody was sent."""
+    toy, first, _ = two
+    (first / "ro-crate-metadata.json").write_text("a crate of the first run")
+    page = toy.folder / "runs" / "page"
+    page.mkdir()
+    (page / "page.html").write_text("a page about the first run")
+    Origin("share", (RunName.of(package.load(first).summary),)).write(page)
+    made = [
+        first / "run.json",
+        first / "report.html",
+        first / "logs" / "events.jsonl",
+        first / "ro-crate-metadata.json",
+    ]
+    for file in (*made, page / "page.html"):
+        copied = shutil.copy(file, tmp_path / f"copy{file.suffix}")
+        found = why(copied, runs=toy.folder / "runs")
+        assert (found.file, Path(found.name).name, found.units) == (copied, file.name, ())
+        assert (found.out, bool(found.notes)) == (first, True)
+        assert found.command == {"page.html": "share", "ro-crate-metadata.json": "crate"}.get(file.name, "")
+    (tmp_path / "empty").touch()
+    with pytest.raises(InputError, match="has written a file with this content"):
+        why(tmp_path / "empty", runs=toy.folder / "runs")
+
+
+def test_files_of_the_same_content_are_named(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    _, first, _ = two
+    run = StoredRun.open(first)
+    name, digest = next(iter(run.summary.files.items()))
+    files = {**run.summary.files, "other/place.txt": digest}
+    (first / "run.json").write_text(run.summary.model_copy(update={"files": files}).model_dump_json())
+    found = why(shutil.copy(first / name, tmp_path / "copy"), runs=first)
+    assert found.notes == ("other files of the run have the same content: other/place.txt",)
+    assert not why(first / name).notes
+
+
+def test_units_of_one_stage_take_one_line(two: tuple[Toy, Path, Path]) -> None:
+    """A file of a capture of nine images had a list of 127 units."""
+    _, first, _ = two
+    origin = why(first / next(iter(package.load(first).summary.files)))
+    lines = [line for line in origin.lines() if line.startswith("  images")]
+    several = [unit for unit in origin.units if unit.stage == "images"]
+    assert len(several) > 1
+    assert len(lines) == 1
+    assert lines[0].endswith(f"{len(several)} units")
 
 
 def test_what_no_run_has_written_is_refused(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
