@@ -229,6 +229,9 @@ def plan(
             show_default=False,
         ),
     ] = "",
+    by_stage: Annotated[
+        bool, typer.Option("--stages", help="List each stage; default: one row for each group of stages.")
+    ] = False,
 ) -> None:
     """Show what a run would compute, and why; nothing is written to the output folder."""
     from pano_mvs.cli.blocks_command import show_blocks
@@ -249,11 +252,11 @@ def plan(
         return
     decision = decide_blocks(session, Execution())
     if decision.division is not None:
-        show_blocks(session, decision, Console(), show=show_plan)
+        show_blocks(session, decision, Console(), show=partial(show_plan, by_stage=by_stage))
         return
     if decision.reason:
         Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
-    show_plan(session, Console())
+    show_plan(session, Console(), by_stage=by_stage)
 
 
 @app.command()
