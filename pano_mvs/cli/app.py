@@ -268,17 +268,16 @@ def check(
     watch: Annotated[
         bool, typer.Option("--watch", help="Check again after each change of its files, until Ctrl-C.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the mistakes and warnings as JSON.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print the mistakes and warnings as JSON; with --watch, each check on a line."),
+    ] = False,
 ) -> None:
     """Check a workflow and report every mistake with its line and column."""
     from pano_mvs.cli.check_command import check_workflow, print_checked, watch_workflow
 
-    if watch and as_json:
-        from pano_mvs.core.errors import UsageError
-
-        raise UsageError("--watch and --json cannot be combined: use one of them")
     if watch:
-        watch_workflow(workflow, overrides or [], images)
+        watch_workflow(workflow, overrides or [], images, as_json=as_json)
     elif as_json:
         print_checked(workflow, overrides or [], images)
     else:

@@ -398,8 +398,9 @@ GROUP_FILE = "pano_mvs: 1\nstages:\n  again: {use: toy.scale}\n"
 NEW_PLUGIN = 'from pano_mvs.api import Pairs, stage\n\n\n@stage(\'a.b\')\ndef f() -> Pairs:\n    """Nothing."""\n'
 
 
+@pytest.mark.parametrize("as_json", [False, True])
 def test_a_workflow_is_checked_again_after_each_change_of_its_files(
-    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
     """Also of a file that it extends, and of a plugin; a mistake does not end it, and Ctrl-C does."""
     monkeypatch.chdir(toy.folder)
@@ -408,6 +409,7 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
         lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scael")),
         lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scael", "use: toy.scale")),
         lambda: toy.edit("plug.py", lambda text: f"{text}\nraise ValueError('broken')\n"),
+        lambda: Path("child.yaml").unlink(),
     ]
 
     def sleep(_seconds: float) -> None:
@@ -416,11 +418,18 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
         changes.pop(0)()
 
     with pytest.raises(KeyboardInterrupt):
-        watch_workflow("child.yaml", [], None, sleep=sleep)
+        watch_workflow("child.yaml", [], None, as_json=as_json, sleep=sleep)
     shown = capsys.readouterr()
-    assert shown.out.count("no mistakes") == 2
-    assert "there is no stage 'toy.scael'" in shown.err
-    assert "broken" in shown.err
+    if as_json:
+        found = [json.loads(line) for line in shown.out.splitlines()]
+        assert [(one["ok"], one["stages"]) for one in found] == [(True, 9), (False, 0), (True, 9), *[(False, 0)] * 2]
+        assert not shown.err
+    else:
+        assert shown.out.count("no mistakes") == 2
+    mistakes = shown.out if as_json else shown.err
+    assert "there is no stage 'toy.scael'" in mistakes
+    assert "broken" in mistakes
+    assert "there is no workflow file 'child.yaml'" in mistakes
 
 
 @pytest.mark.parametrize(
