@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
 from pano_mvs.geometry import geodesic_angle
 from pano_mvs.geometry.pose_errors import align_centers, camera_extent
+from pano_mvs.session.code_listing import changed_functions, read_code_listing
 from pano_mvs_lineage.range_changes import RangeChange, range_changes
 from pano_mvs_lineage.stored_runs import StoredRun
 
@@ -158,10 +159,11 @@ def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = No
 def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
     """Return for each stage of both runs why its units are not the same; stages without a difference are left out.
 
-    A stage whose inputs alone differ names the stages that made these.
+    A stage whose inputs alone differ names the stages that made these. The order is that of the workflow.
     """
     found: dict[str, str] = {}
-    for stage in new.keys:
+    order = [outcome.name for outcome in new.summary.stages]
+    for stage in sorted(new.keys, key=lambda name: order.index(name) if name in order else len(order)):
         before, after = old.keys.get(stage), new.keys[stage]
         if before is None or before == after:
             continue
@@ -175,7 +177,14 @@ def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
         for item in changed:
             one, other = old.record(stage, item), new.record(stage, item)
             if one is not None and other is not None:
-                parts.append(_reason(one.identity, other.identity, producers=new.producers.get(stage, {})))
+                codes = [
+                    read_code_listing(run.out, stage, str(record.identity.get("code")))
+                    for run, record in ((old, one), (new, other))
+                ]
+                functions = changed_functions(*codes)
+                parts.append(
+                    _reason(one.identity, other.identity, producers=new.producers.get(stage, {}), functions=functions)
+                )
                 break
         else:
             if changed:
@@ -186,7 +195,15 @@ def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
     return found
 
 
-def _reason(before: Mapping[str, Any], after: Mapping[str, Any], *, producers: Mapping[str, str]) -> str:
+def _reason(
+    before: Mapping[str, Any], after: Mapping[str, Any], *, producers: Mapping[str, str], functions: Sequence[str]
+) -> str:
+    """Return why two identities of a unit differ.
+
+    Args:
+        producers: port to the stage that feeds it.
+        functions: those of its code that differ, by file, as far as they are known.
+    """
     parts = []
     if before.get("stage") != after.get("stage"):
         return f"stage {before.get('stage')} → {after.get('stage')}"
@@ -195,7 +212,8 @@ def _reason(before: Mapping[str, Any], after: Mapping[str, Any], *, producers: M
     if before.get("version") != after.get("version"):
         parts.append(f"version {before.get('version')} → {after.get('version')}")
     if before.get("code") != after.get("code"):
-        parts.append(f"code of {after.get('stage')}")
+        which = f" ({shortened_list(list(functions), 8)})" if functions else ""
+        parts.append(f"code of {after.get('stage')}{which}")
     parts += [f"library {change}" for change in _changes(before.get("libraries", {}), after.get("libraries", {}))]
     parts += [f"kind {change}" for change in _changes(before.get("kinds", {}), after.get("kinds", {}))]
     inputs = _changes(before.get("inputs", {}), after.get("inputs", {}))

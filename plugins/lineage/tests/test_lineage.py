@@ -120,8 +120,28 @@ def test_images_and_code_that_differ_are_reasons(toy: Toy) -> None:
     second = run_into(toy, "second")
     found = diff(first, second)
     assert [change.name for change in found.images] == ["1.txt"]
-    assert "code of toy.scale" in found.reasons["scaled"]
+    assert "code of toy.scale (plug.py: scale)" in found.reasons["scaled"]
     assert any("other content: 1.txt" in line for line in found.lines())
+
+
+def test_the_functions_that_differ_are_named(toy: Toy) -> None:
+    """Only the stage was named, whose code are all modules that it imports."""
+    first = run_into(toy, "first")
+    toy.edit("helper.py", lambda text: text.replace("return 2 * x", "return x * 2") + "\nLIMIT = 3\n")
+    second = run_into(toy, "second")
+    assert diff(first, second).reasons["scaled"] == "code of toy.scale (helper.py: outside of functions, double)"
+    toy.edit("helper.py", lambda text: f"# a comment\n{text}")
+    assert diff(second, run_into(toy, "third")).is_same
+    (second / "logs" / "code.json").write_text("[]")
+    assert diff(first, second).reasons["scaled"] == "code of toy.scale"
+
+
+def test_reasons_are_in_the_order_of_the_workflow(two: tuple[Toy, Path, Path]) -> None:
+    _, first, second = two
+    stages = [stage.name for stage in package.load(second).summary.stages]
+    reasons = list(diff(first, second).reasons)
+    assert len(reasons) > 2
+    assert reasons == [name for name in stages if name in reasons] != sorted(reasons)
 
 
 def test_images_of_the_same_name_in_two_folders_are_two(two: tuple[Toy, Path, Path]) -> None:
