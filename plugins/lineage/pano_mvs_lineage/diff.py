@@ -16,7 +16,7 @@ from pano_mvs.core.text import finite_or_none, plural, shortened_list
 from pano_mvs.geometry import geodesic_angle
 from pano_mvs.geometry.pose_errors import align_centers, camera_extent
 from pano_mvs.session.code_listing import changed_functions, read_code_listing
-from pano_mvs_lineage.range_changes import RangeChange, range_changes
+from pano_mvs_lineage.range_changes import CLASSES, RangeChange, range_changes
 from pano_mvs_lineage.stored_runs import StoredRun
 
 # Cameras that moved less are counted, not listed: a global solve moves every camera a little.
@@ -60,6 +60,21 @@ class PoseChanges:
 
 
 @dataclass(frozen=True)
+class DiffPart:
+    """What differs in one respect, as lines, and as a table where there are many figures."""
+
+    title: str
+    lines: tuple[str, ...]
+    columns: tuple[str, ...] = ()  # of the table; empty if there is none
+    rows: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def text(self) -> list[str]:
+        """The title and the lines below it."""
+        return [f"{self.title}:", *(f"  {line}" for line in self.lines)]
+
+
+@dataclass(frozen=True)
 class RunDiff:
     """What differs between two runs; empty parts are equal."""
 
@@ -90,25 +105,34 @@ class RunDiff:
         plain: dict[str, Any] = _plain(values)
         return plain
 
-    def lines(self) -> list[str]:
-        """Return the differences as text, the most telling first."""
+    def parts(self) -> list[DiffPart]:
+        """Return the differences in parts, the most telling first; parts that are equal are left out."""
         if self.is_same:
             same = "the same settings, images, code and files"
-            return [f"{same}, as far as they could be compared:" if self.notes else same, *self.notes]
-        parts: list[tuple[str, list[str]]] = [
-            ("notes", list(self.notes)),
-            ("outcome", list(map(str, self.outcome))),
-            ("stages", list(map(str, self.stages))),
-            ("settings", list(map(str, self.settings))),
-            ("versions", list(map(str, self.versions))),
-            ("why units differ", [f"{stage}: {reason}" for stage, reason in self.reasons.items()]),
-            ("images", _image_lines(self.images)),
-            ("metrics", list(map(str, self.metrics))),
-            ("poses", _pose_lines(self.poses)),
-            ("ranges", [str(one) for one in self.ranges]),
-            ("files", _file_lines(self.files)),
+            return [DiffPart(f"{same}, as far as they could be compared" if self.notes else same, self.notes)]
+        reasons = tuple(f"{stage}: {reason}" for stage, reason in self.reasons.items())
+        parts = [
+            DiffPart("notes", self.notes),
+            DiffPart("outcome", tuple(map(str, self.outcome))),
+            DiffPart("stages", tuple(map(str, self.stages))),
+            DiffPart("settings", tuple(map(str, self.settings))),
+            DiffPart("versions", tuple(map(str, self.versions))),
+            DiffPart("why units differ", reasons),
+            DiffPart("images", tuple(_image_lines(self.images))),
+            DiffPart(
+                "metrics", tuple(map(str, self.metrics)), ("metric", "before", "after"), _metric_rows(self.metrics)
+            ),
+            DiffPart("poses", tuple(_pose_lines(self.poses))),
+            DiffPart("ranges", tuple(map(str, self.ranges)), _RANGE_COLUMNS, _range_rows(self.ranges)),
+            DiffPart("files", tuple(_file_lines(self.files))),
         ]
-        return [line for title, found in parts if found for line in (f"{title}:", *(f"  {each}" for each in found))]
+        return [part for part in parts if part.lines]
+
+    def lines(self) -> list[str]:
+        """Return the differences as text."""
+        if self.is_same and not self.notes:
+            return [self.parts()[0].title]
+        return [line for part in self.parts() for line in part.text]
 
 
 def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = None) -> RunDiff:
@@ -189,7 +213,7 @@ def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
         else:
             if changed:
                 parts.append("the cache no longer has what its units were made of")
-        if len(changed) < len(common):
+        if 0 < len(changed) < len(common):
             parts.append(f"{len(changed)} of {len(common)} units")
         found[stage] = "; ".join(part for part in parts if part)
     return found
@@ -358,6 +382,26 @@ def _image_lines(images: tuple[Change, ...]) -> list[str]:
         ("other content", [one.name for one in images if None not in (one.before, one.after)]),
     )
     return [f"{what}: {shortened_list(names, 8)}" for what, names in parts if names]
+
+
+def _metric_rows(metrics: tuple[Change, ...]) -> tuple[tuple[str, ...], ...]:
+    return tuple((one.name, _text(one.before), _text(one.after)) for one in metrics)
+
+
+_RANGE_COLUMNS = ("view", "differ by over 1 %", *CLASSES, "only before", "only after")
+
+
+def _range_rows(ranges: tuple[RangeChange, ...]) -> tuple[tuple[str, ...], ...]:
+    return tuple(
+        (
+            one.name,
+            f"{one.changed:.1%}",
+            *(f"{one.by_class[name]:.1%}" if name in one.by_class else "–" for name in CLASSES),
+            f"{one.only_before:.1%}",
+            f"{one.only_after:.1%}",
+        )
+        for one in ranges
+    )
 
 
 def _file_lines(files: tuple[Change, ...]) -> list[str]:

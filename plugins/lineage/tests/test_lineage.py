@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_lineage.diff import Change, PoseChanges, _images, diff
+from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, diff
 from pano_mvs_lineage.page import diff_page
 from pano_mvs_lineage.range_changes import compare_ranges
 from pano_mvs_lineage.runs import runs
@@ -122,6 +122,13 @@ def test_images_and_code_that_differ_are_reasons(toy: Toy) -> None:
     assert [change.name for change in found.images] == ["1.txt"]
     assert "code of toy.scale (plug.py: scale)" in found.reasons["scaled"]
     assert any("other content: 1.txt" in line for line in found.lines())
+
+
+def test_images_that_were_added_are_counted_alone(toy: Toy) -> None:
+    """It said that 0 of 5 units differ."""
+    first = run_into(toy, "first")
+    toy.number("6.txt", "8")
+    assert diff(first, run_into(toy, "second")).reasons["images"] == "1 unit more"
 
 
 def test_the_functions_that_differ_are_named(toy: Toy) -> None:
@@ -398,6 +405,20 @@ def test_the_commands_print_text_and_json(two: tuple[Toy, Path, Path], pano_mvs:
     assert pano_mvs("diff", first, toy.folder / "nowhere").code == 2
 
 
+def test_figures_are_tables() -> None:
+    """They were lines of text, in which no column could be compared."""
+    change = compare_ranges("a.png", np.full((8, 16), 2.0, np.float32), np.full((8, 16), 2.1, np.float32))
+    found = RunDiff(
+        Path("a"), Path("b"), settings=(Change("s.x", 1, 2),), metrics=(Change("s.y", 0.5, None),), ranges=(change,)
+    )
+    settings, metrics, ranges = found.parts()
+    assert (settings.rows, settings.lines) == ((), ("s.x: 1 → 2",))
+    assert (metrics.columns, metrics.rows) == (("metric", "before", "after"), (("s.y", "0.5", "–"),))
+    assert ranges.columns == ("view", "differ by over 1 %", "confirmed", "seen", "filled", "only before", "only after")
+    assert ranges.rows == (("a.png", "100.0%", "–", "–", "–", "0.0%", "0.0%"),)
+    assert found.lines()[2:4] == ["metrics:", "  s.y: 0.5 → –"]
+
+
 def test_ranges_are_compared_by_class_and_by_solid_angle() -> None:
     before = np.full((8, 16), 2.0, np.float32)
     after = before.copy()
@@ -442,6 +463,8 @@ def test_two_real_runs_are_compared_with_poses_and_ranges(rendered: Path, tmp_pa
     page = diff_page(found)
     assert page.count("<figure>") == 4
     assert page.count("data:image/jpeg") == 12
+    assert page.count('<div class="beside">') == 4
+    assert page.count("<td>000.png</td>") == 1
     table = runs([tmp_path])
     assert table.settings == ("depth.planes",)
     assert "scores.median_pair_error_deg" in table.metrics
