@@ -142,6 +142,7 @@ class WorkflowReader:
             name: entry for name, node in entries.items() if (entry := self._stage(name, node, groups)) is not None
         }
         if self.problems.lines:
+            self._hint_at_vary(overrides)
             unknown = frozenset({*merged.written, *entries} - set(stages))
             raise InvalidWorkflowError(self.problems.lines, stages, unknown)
         root = files[-1].root
@@ -211,6 +212,16 @@ class WorkflowReader:
                 rest.append(text)
         self.folders |= {one.shown_as: one.base for one in merged.group_files}
         return rest
+
+    def _hint_at_vary(self, overrides: Sequence[str]) -> None:
+        """Add to the errors about several values of a setting which command takes these."""
+        for text in overrides:
+            target, _, written = text.partition("=")
+            if "," not in written or written.strip().startswith(("[", "{", '"', "'")):
+                continue
+            hint = f". `pano-mvs vary --set {target.strip()}={written.strip()}` runs with each of these values"
+            lines = self.problems.lines
+            lines[:] = [f"{line}{hint}" if line.startswith(f"--set {target.strip()}:") else line for line in lines]
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:
