@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import read_regular, write_text
@@ -20,8 +21,8 @@ _SCHEMA = 1
 def write_code_listing(out: Path, workflow: Workflow) -> None:
     """Write the functions that the stages of a workflow use, unless the folder lists them already.
 
-    They only serve to explain differences: a folder that cannot be written, or a file that was changed meanwhile, is no
-    error.
+    They only serve to explain differences: if the folder cannot be written, or a file was changed meanwhile, nothing is
+    listed.
     """
     with suppress(StoreError, OSError, SyntaxError):
         entries = workflow.stages.items()
@@ -67,7 +68,7 @@ def changed_functions(before: Mapping[str, Mapping[str, str]], after: Mapping[st
     return found
 
 
-def _read(out: Path) -> Mapping[str, object]:
+def _read(out: Path) -> Mapping[str, Any]:
     try:
         found = json.loads(read_regular(out / LOG_FOLDER / CODE_JSON))
     except (OSError, ValueError, RecursionError):
