@@ -59,7 +59,7 @@ def print_checked(workflow: str, overrides: Sequence[str], images: Path | None) 
 
 
 def _checked(
-    workflow: str, overrides: Sequence[str], images: Path | None, on_file: Callable[[Path], None] = lambda _: None
+    workflow: str, overrides: Sequence[str], images: Path | None, *, on_file: Callable[[Path], None] = lambda _: None
 ) -> WorkflowCheck:
     """Check a workflow, and return what is wrong with it."""
     try:
@@ -94,7 +94,7 @@ def watch_workflow(
         note = partial(_note, checked)
         try:
             if as_json:
-                print(json.dumps(_checked(workflow, overrides, images, note).to_json()), flush=True)
+                print(json.dumps(_checked(workflow, overrides, images, on_file=note).to_json()), flush=True)
             else:
                 check_workflow(workflow, overrides, images, on_file=note)
         except (WorkflowError, UsageError, InputError) as error:

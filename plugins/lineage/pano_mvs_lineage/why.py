@@ -133,7 +133,9 @@ def why(
     made_by = Origin.read(place) if place is not None and not is_file(place / RUN_JSON) else None
     searched = as_paths(runs) if runs else []
     if place is not None and made_by is not None:
-        return _derived(path, path.absolute().relative_to(place.absolute()), made_by, place, searched, root)
+        return _derived(
+            path, path.absolute().relative_to(place.absolute()), made_by, folder=place, searched=searched, root=root
+        )
     digest = digest_from_file(path)
     if place is not None:
         run, name = StoredRun.open(place, root), path.absolute().relative_to(place.absolute()).as_posix()
@@ -169,7 +171,7 @@ def _by_content(path: Path, digest: str, searched: list[Path], root: Path | None
         made_by = Origin.read(folder)
         copied = next((one for one in _files_below(folder) if _is_copy(path, digest, one)), None)
         if made_by is not None and copied is not None:
-            return _derived(path, copied.relative_to(folder), made_by, folder, searched, root)
+            return _derived(path, copied.relative_to(folder), made_by, folder=folder, searched=searched, root=root)
     where = ", ".join(map(str, searched)) or "the current folder"
     raise InputError(f"{path}: no run in {where} has written a file with this content. Name its folder with --runs")
 
@@ -268,7 +270,7 @@ def _folder_above(path: Path) -> Path | None:
 
 
 def _derived(
-    path: Path, name: Path, origin: Origin, folder: Path, searched: list[Path], root: Path | None
+    path: Path, name: Path, origin: Origin, *, folder: Path, searched: list[Path], root: Path | None
 ) -> FileOrigin:
     """Return the origin of a file that a command made from runs.
 
