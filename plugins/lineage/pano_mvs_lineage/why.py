@@ -139,6 +139,8 @@ def why(
     digest = digest_from_file(path)
     if place is not None:
         run, name = StoredRun.open(place, root), path.absolute().relative_to(place.absolute()).as_posix()
+        if run.summary.merged is not None:
+            return _merged(path, name, run, root)
         if name in run.summary.files:
             return _origin(path, name, run, was_changed=digest != run.summary.files[name])
         if found := _beside(path, name, run) or _delivered(path, digest, run):
@@ -167,6 +169,10 @@ def _by_content(path: Path, digest: str, searched: list[Path], root: Path | None
             found = _beside(path, name, run) if _is_copy(path, digest, run.out / name) else None
             if found is not None:
                 return found
+        if run.summary.merged is not None:
+            copied = next((one for one in _files_below(run.out, is_run=True) if _is_copy(path, digest, one)), None)
+            if copied is not None:
+                return _merged(path, copied.relative_to(run.out).as_posix(), run, root)
     for folder in _folders_of_commands(below):
         made_by = Origin.read(folder)
         copied = next((one for one in _files_below(folder) if _is_copy(path, digest, one)), None)
@@ -214,10 +220,36 @@ def _folders_of_commands(folders: Iterable[Path]) -> Iterator[Path]:
                 yield Path(folder)
 
 
-def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder that a command made, without those of the runs in it."""
+def _merged(path: Path, name: str, run: StoredRun, root: Path | None) -> FileOrigin:
+    """Return the origin of a file in the folder of a merged run: the runs of its blocks."""
+    folders = run.summary.merged.blocks if run.summary.merged is not None else ()
+    images: dict[tuple[str, str], str] = {}  # blocks share images, each by a link of its own
+    for block in _readable([Path(folder) for folder in folders], root):
+        for image, digest in block.summary.inputs.items():
+            images.setdefault((Path(image).name, digest), image)
+    note = f"merged from {len(folders)} {plural(len(folders), 'block')}: {shortened_list(list(map(str, folders)))}"
+    return FileOrigin(
+        path,
+        name,
+        run.out,
+        workflow=run.summary.workflow.name,
+        started=run.summary.started,
+        version=run.summary.version,
+        units=(),
+        images={image: digest for (_, digest), image in images.items()},
+        notes=(f"{note}; ask about a file of a block for its units",),
+        command="merge",
+    )
+
+
+def _files_below(folder: Path, *, is_run: bool = False) -> Iterator[Path]:
+    """Yield the files in a folder that a command made, without those of the runs in it.
+
+    Args:
+        is_run: whether the folder itself is that of a run.
+    """
     for inner, names, files in os.walk(folder):
-        if RUN_JSON in files:
+        if RUN_JSON in files and not (is_run and Path(inner) == folder):
             names.clear()
             continue
         yield from (Path(inner, name) for name in files if not name.startswith("."))

@@ -341,6 +341,22 @@ def test_copies_of_what_no_unit_made_are_found_by_their_content(two: tuple[Toy, 
         why(tmp_path / "empty", runs=toy.folder / "runs")
 
 
+def test_a_file_of_a_merged_run_leads_to_its_blocks(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """It was refused, as a file that the run has not written."""
+    _, first, second = two
+    merged = first.parent / "merged"
+    merged.mkdir()
+    (merged / "run.json").write_text(json.dumps({"stages": [], "merged": {"blocks": [str(first), str(second)]}}))
+    (merged / "cloud.ply").write_text("a merged cloud")
+    for file in (merged / "cloud.ply", Path(shutil.copy(merged / "cloud.ply", tmp_path / "copy.ply"))):
+        found = why(file, runs=() if file.parent == merged else merged)
+        assert (found.name, found.out, found.command, found.units) == ("cloud.ply", merged, "merge", ())
+        assert found.notes[0].startswith(f"merged from 2 blocks: {first}, {second}")
+        assert found.images == dict(package.load(first).summary.inputs)
+    notes = diff(merged, first).notes
+    assert any(note.startswith(f"{merged} was merged from blocks") for note in notes)
+
+
 def test_files_of_the_same_content_are_named(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
     _, first, _ = two
     run = StoredRun.open(first)
