@@ -229,6 +229,9 @@ def plan(
             show_default=False,
         ),
     ] = "",
+    by_stage: Annotated[
+        bool, typer.Option("--stages", help="List each stage; default: one row for each group of stages.")
+    ] = False,
 ) -> None:
     """Show what a run would compute, and why; nothing is written to the output folder."""
     from pano_mvs.cli.blocks_command import show_blocks
@@ -249,11 +252,11 @@ def plan(
         return
     decision = decide_blocks(session, Execution())
     if decision.division is not None:
-        show_blocks(session, decision, Console(), show=show_plan)
+        show_blocks(session, decision, Console(), show=partial(show_plan, by_stage=by_stage))
         return
     if decision.reason:
         Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
-    show_plan(session, Console())
+    show_plan(session, Console(), by_stage=by_stage)
 
 
 @app.command()
@@ -265,17 +268,16 @@ def check(
     watch: Annotated[
         bool, typer.Option("--watch", help="Check again after each change of its files, until Ctrl-C.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the mistakes and warnings as JSON.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print the mistakes and warnings as JSON; with --watch, each check on a line."),
+    ] = False,
 ) -> None:
     """Check a workflow and report every mistake with its line and column."""
     from pano_mvs.cli.check_command import check_workflow, print_checked, watch_workflow
 
-    if watch and as_json:
-        from pano_mvs.core.errors import UsageError
-
-        raise UsageError("--watch and --json cannot be combined: use one of them")
     if watch:
-        watch_workflow(workflow, overrides or [], images)
+        watch_workflow(workflow, overrides or [], images, as_json=as_json)
     elif as_json:
         print_checked(workflow, overrides or [], images)
     else:

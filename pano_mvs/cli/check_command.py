@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -51,24 +52,37 @@ def print_checked(workflow: str, overrides: Sequence[str], images: Path | None) 
     Raises:
         UsageError: if there is no such workflow.
     """
-    try:
-        session = open_session(workflow, overrides=overrides, images=images)
-        found = WorkflowCheck(workflow, len(session.workflow.stages), warnings=tuple(session.workflow.warnings))
-    except (WorkflowError, InputError) as error:
-        found = WorkflowCheck(workflow, problems=tuple(problems_of(error)))
+    found = _checked(workflow, overrides, images)
     print_json(found.to_json())
     if not found.ok:
         raise typer.Exit(WorkflowError.exit_code)
 
 
+def _checked(
+    workflow: str, overrides: Sequence[str], images: Path | None, *, on_file: Callable[[Path], None] = lambda _: None
+) -> WorkflowCheck:
+    """Check a workflow, and return what is wrong with it."""
+    try:
+        session = open_session(workflow, overrides=overrides, images=images, on_file=on_file)
+    except (WorkflowError, InputError) as error:
+        return WorkflowCheck(workflow, problems=tuple(problems_of(error)))
+    return WorkflowCheck(workflow, len(session.workflow.stages), warnings=tuple(session.workflow.warnings))
+
+
 def watch_workflow(
-    workflow: str, overrides: Sequence[str], images: Path | None, *, sleep: Callable[[float], None] = time.sleep
+    workflow: str,
+    overrides: Sequence[str],
+    images: Path | None,
+    *,
+    as_json: bool = False,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> None:
     """Check a workflow now and after each change of its files, until the user interrupts.
 
     After a check that fails, all files are watched that it has read or missed.
 
     Args:
+        as_json: whether to print each check as a JSON object on a line.
         sleep: waits between two looks at the files.
 
     Raises:
@@ -77,13 +91,21 @@ def watch_workflow(
     first = find_workflow(workflow, presets_folder())[0]
     while True:
         checked = {first: _time(first)}
+        note = partial(_note, checked)
         try:
-            check_workflow(workflow, overrides, images, on_file=partial(_note, checked))
+            if as_json:
+                print(json.dumps(_checked(workflow, overrides, images, on_file=note).to_json()), flush=True)
+            else:
+                check_workflow(workflow, overrides, images, on_file=note)
         except (WorkflowError, UsageError, InputError) as error:
-            _print(error)
+            if as_json:  # such as a file that is gone
+                print(json.dumps(WorkflowCheck(workflow, problems=(str(error),)).to_json()), flush=True)
+            else:
+                _print(error)
         while all(_time(path) == before for path, before in checked.items()):
             sleep(_INTERVAL_S)
-        Console().say("")
+        if not as_json:
+            Console().say("")
 
 
 def _note(checked: dict[Path, tuple[int, int] | None], path: Path) -> None:

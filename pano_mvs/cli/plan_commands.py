@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,21 +47,22 @@ def show_dry_run(session: Session, console: Console, *, execution: Execution, as
     show_plan(session, console, workers=size.workers, threads=size.threads)
 
 
-def show_plan(session: Session, console: Console, *, workers: int = 0, threads: int = 0) -> RunPlan:
-    """Print for each stage the units that are cached and that would or may run, with reasons, times and sizes.
+def show_plan(
+    session: Session, console: Console, *, workers: int = 0, threads: int = 0, by_stage: bool = False
+) -> RunPlan:
+    """Print for each group of stages the units that are cached and that would or may run, with times, and the reasons.
 
     Args:
         workers: number of units at a time, for the times; 0 for the default.
         threads: of each worker; 0 for the default.
+        by_stage: whether each stage has a row of its own, also those in groups.
     """
     run_plan = plan_session(session, workers=workers, threads=threads)
-    is_blocked = any(plan.blocked for plan in run_plan.stages)
-    table = Table("stage", "use", "cached", "run", "may run", *(["cannot run"] if is_blocked else []), "time", "disk")
-    for plan, forecast in zip(run_plan.stages, run_plan.forecasts, strict=True):
-        counts = [str(len(plan.cached) or ""), str(len(plan.run) or ""), _may_run(plan, forecast)]
-        counts += [str(len(plan.blocked) or "")] if is_blocked else []
-        table.add_row(plan.name, plan.use, *counts, *_expected(forecast, run_plan.workers))
-    console.print(table)
+    console.print(_table(run_plan, {} if by_stage else run_plan.groups))
+    if run_plan.groups and not by_stage:
+        counts = [(len(run_plan.stages), "stage"), (len(run_plan.groups), "group")]
+        text = " in ".join(f"{count} {plural(count, what)}" for count, what in counts)
+        console.say(f"{text}; pano-mvs plan --stages lists each")
     for plan in run_plan.stages:
         by_reason = Counter(plan.run.values())
         for reason, count in by_reason.most_common(_SHOWN_REASONS):
@@ -80,21 +81,54 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
     return run_plan
 
 
-def _may_run(plan: StagePlan, forecast: StageForecast) -> str:
-    """Return the number of units that depend on others; of a stage whose units are not known yet, the expected one."""
-    if not plan.open:
-        return str(len(plan.may_run) or "")
-    return "all" if forecast.units is None else f"about {forecast.units}"
+def _table(run_plan: RunPlan, groups: Mapping[str, Sequence[str]]) -> Table:
+    """Return a table with a row for each group, and for each stage that is in none."""
+    group_of = {stage: group for group, stages in groups.items() for stage in stages}
+    rows: dict[str, list[tuple[StagePlan, StageForecast]]] = {}
+    for plan, forecast in zip(run_plan.stages, run_plan.forecasts, strict=True):
+        rows.setdefault(group_of.get(plan.name, f":{plan.name}"), []).append((plan, forecast))
+    is_blocked = any(plan.blocked for plan in run_plan.stages)
+    first = ("group", "stages to compute") if groups else ("stage", "use")
+    table = Table(*first, "cached", "run", "may run", *(["cannot run"] if is_blocked else []), "time", "disk")
+    for name, members in rows.items():
+        is_group = not name.startswith(":")
+        plans = [plan for plan, _ in members]
+        counts = [str(sum(map(len, found)) or "") for found in ([p.cached for p in plans], [p.run for p in plans])]
+        counts.append(_may_run(members))
+        counts += [str(sum(len(plan.blocked) for plan in plans) or "")] if is_blocked else []
+        pending = [plan.name for plan, forecast in members if forecast.units != 0 or plan.blocked]
+        named = (plans[0].name, plans[0].use)
+        if groups:
+            named = (name if is_group else "", shortened_list(pending, 3) if is_group else plans[0].name)
+        table.add_row(*named, *counts, *_expected([forecast for _, forecast in members], run_plan.workers))
+    return table
 
 
-def _expected(forecast: StageForecast, workers: int) -> tuple[str, str]:
-    """Return the expected time and disk space of a stage as text; empty if it computes nothing."""
-    if forecast.units == 0:
+def _may_run(members: Sequence[tuple[StagePlan, StageForecast]]) -> str:
+    """Return the number of units that depend on others; of stages whose units are not known yet, the expected one."""
+    count = sum(len(plan.may_run) for plan, _ in members if not plan.open)
+    open_units = [forecast.units for plan, forecast in members if plan.open]
+    if not open_units:
+        return str(count or "")
+    known = [units for units in open_units if units is not None]
+    if len(known) == len(open_units):
+        return f"about {count + sum(known)}"
+    return f"at least {count + sum(known)}" if known or count else "all"
+
+
+def _expected(forecasts: Sequence[StageForecast], workers: int) -> tuple[str, str]:
+    """Return the expected time and disk space of stages as text; empty if they compute nothing."""
+    own = [one for one in forecasts if one.units != 0]
+    known = [one for one in own if one.seconds is not None]
+    if not own:
         return "", ""
-    if forecast.seconds is None or forecast.stored_bytes is None:
+    if not known:
         return "unknown", "unknown"
-    at_a_time = max(1, min(workers, forecast.units or 1))
-    return duration_text(forecast.seconds / at_a_time), size_text(round(forecast.stored_bytes))
+    seconds = sum((one.seconds or 0.0) / max(1, min(workers, one.units or 1)) for one in known)
+    at_least = "" if len(known) == len(own) else "at least "
+    kept = [one for one in known if not one.is_temporary]
+    size = f"{at_least}{size_text(round(sum(one.kept_bytes or 0.0 for one in kept)))}" if kept else "dropped"
+    return f"{at_least}{duration_text(seconds)}", size
 
 
 def _print_total(run_plan: RunPlan, console: Console) -> None:
@@ -114,6 +148,8 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
         bound = "at least" if unknown else "about"
         size = size_text(round(run_plan.stored_bytes))
         text = f"{bound} {duration_text(run_plan.seconds)} with {workers}, and {size} in the cache, by earlier runs"
+        if dropped := round(run_plan.dropped_bytes):
+            text += f"; up to {size_text(dropped)} more until it drops the results of temporary stages"
         text += f"; unknown: {shortened_list(unknown)}" if unknown else ""
         text += "; compiling kernels, which the first run does once, is not included" if must_compile() else ""
     console.say(escape(text))

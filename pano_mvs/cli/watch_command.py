@@ -172,7 +172,8 @@ class WatchDisplay(ProgressDisplay):
             free = f"{size_text(shutil.disk_usage(self._start.cache).free)} free for the cache"
         except OSError as error:
             return f"{workers}; the cache {self._start.cache} cannot be seen from here ({error.strerror})"
-        left = [(stage.units_left(), stage.forecast.unit_bytes) for stage in self._estimator.stages.values()]
+        kept = [stage for stage in self._estimator.stages.values() if not stage.forecast.is_temporary]
+        left = [(stage.units_left(), stage.forecast.unit_bytes) for stage in kept]
         known = [units * size for units, size in left if units is not None and size is not None]
         is_least = any(units != 0 and (units is None or size is None) for units, size in left)
         about = "at least" if is_least else "about"

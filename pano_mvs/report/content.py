@@ -28,7 +28,7 @@ from pano_mvs.results.coverage import coverage, coverage_from_fact, coverage_key
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.next_time import Suggestion, marks_of, suggestions
 from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_panels
-from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
+from pano_mvs.results.records import PairLink, PosesSummary, StageOutcome, UnitCounts, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
@@ -246,6 +246,36 @@ def panorama_rows(
             )
         )
     return tuple(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class StageGroupRow:
+    """What a group of stages did, or a stage that is in none."""
+
+    name: str
+    stages: tuple[str, ...]  # its stages; empty for a stage in no group
+    counts: UnitCounts  # sums over its stages
+    units: int
+    work_s: float | None  # sum over its computed units; None if a stage does not state it
+
+
+def stage_groups(stages: Sequence[StageOutcome]) -> tuple[StageGroupRow, ...]:
+    """Return a row for each group of stages, and for each stage that is in none; empty if there are no groups."""
+    members: dict[tuple[str, str], list[StageOutcome]] = {}
+    for stage in stages:
+        members.setdefault((stage.group, "" if stage.group else stage.name), []).append(stage)
+    if not any(group for group, _ in members):
+        return ()
+    return tuple(
+        StageGroupRow(
+            group or name,
+            tuple(stage.name for stage in own) if group else (),
+            UnitCounts(**{field: sum(getattr(stage, field) for stage in own) for field in UnitCounts.model_fields}),
+            sum(stage.units for stage in own),
+            None if any(stage.unit_seconds is None for stage in own) else sum(stage.unit_seconds or 0 for stage in own),
+        )
+        for (group, name), own in members.items()
+    )
 
 
 @dataclass(frozen=True)

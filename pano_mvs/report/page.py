@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import duration_text, plural
-from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather
+from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather, stage_groups
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
 from pano_mvs.results.colors import probability_color
@@ -58,6 +58,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
             run=summary,
             run_notes=notes,
             folders=sorted(folders.items()),
+            stage_groups=stage_groups(summary.stages),
             longest=max((stage.seconds for stage in summary.stages), default=0) or 1,
             content=content,
             most_shown=200,

@@ -77,6 +77,9 @@ def problems_of(error: PanoMvsError) -> list[str]:
     return error.problems if isinstance(error, WorkflowError) else [str(error)]
 
 
+_NOT_TEXT = "must be the text of a workflow file, such as Path(...).read_text()"
+
+
 def format_workflow(text: str) -> str:
     r"""Return the text of a workflow file, laid out as the presets are; comments are kept.
 
@@ -86,7 +89,10 @@ def format_workflow(text: str) -> str:
 
     Raises:
         WorkflowError: if the text is not a YAML mapping, or has mistakes that leave open what it means.
+        UsageError: if it is a path.
     """
     if not isinstance(text, str):
-        raise UsageError("text must be the text of a workflow file, such as Path(...).read_text()")
+        raise UsageError(f"text {_NOT_TEXT}")
+    if "\n" not in text and text.rstrip().endswith((".yaml", ".yml")):
+        raise UsageError(f"text={text[:80]!r} is the name of a file: it {_NOT_TEXT}")
     return formatted(text, "text")

@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -38,6 +38,7 @@ class RunPlan:
     forecasts: tuple[StageForecast, ...] = ()  # what each stage is expected to take, by earlier runs with this cache
     workers: int = 1  # number of units at a time for which `seconds` holds
     report_s: float = 0.0  # expected seconds for the report; 0 if unknown
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # group of stages to those of it in the plan
 
     def __getitem__(self, stage: str) -> StagePlan:
         """Return the plan of one stage.
@@ -62,8 +63,13 @@ class RunPlan:
 
     @property
     def stored_bytes(self) -> float:
-        """Expected size of the results in the cache, without the stages in `unknown`."""
-        return sum(one.stored_bytes or 0.0 for one in self.forecasts)
+        """Expected size of the results that stay in the cache, without the stages in `unknown`."""
+        return sum(one.kept_bytes or 0.0 for one in self.forecasts)
+
+    @property
+    def dropped_bytes(self) -> float:
+        """Expected size of the results that the run stores and drops again, without the stages in `unknown`."""
+        return sum(one.stored_bytes or 0.0 for one in self.forecasts if one.is_temporary)
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -141,8 +147,11 @@ def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> Run
         store.stat_cache.save()
     workers, threads = shape(workers, threads)
     experience = Experience(listing.size(), (store.unit_times,), threads)
-    forecasts = forecast(plans, workflow, graph, experience=experience)
-    return RunPlan(tuple(plans), forecasts, workers, expected_report_s(forecasts, experience))
+    forecasts = forecast(plans, workflow, graph, experience=experience, options=session.run_options)
+    planned = {plan.name for plan in plans}
+    groups = {name: tuple(one for one in group.stages if one in planned) for name, group in workflow.groups.items()}
+    groups = {name: stages for name, stages in groups.items() if stages}
+    return RunPlan(tuple(plans), forecasts, workers, expected_report_s(forecasts, experience), groups)
 
 
 @contextmanager
@@ -179,7 +188,7 @@ def forecast_run(run: Run) -> Forecast | None:
     except PanoMvsError:
         return None  # the run reports the error
     experience = Experience(run.listing.size(), (run.store.unit_times, reference_times()), run.executor.threads)
-    stages = forecast(plans, run.workflow, run.graph, experience=experience)
+    stages = forecast(plans, run.workflow, run.graph, experience=experience, options=run.options)
     return Forecast(stages, expected_report_s(stages, experience), must_compile())
 
 

@@ -30,6 +30,7 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.session.code_listing import write_code_listing
 from pano_mvs.session.observers import Observers
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted
@@ -218,6 +219,7 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
     finally:
         summary.write(run.out)
     write_page(run.out, summary, report)
+    write_code_listing(run.out, run.workflow)
     return summary, values
 
 

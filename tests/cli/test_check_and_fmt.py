@@ -22,7 +22,6 @@ def test_check_prints_what_is_wrong_as_json(pano_mvs: Command) -> None:
     found = json.loads(bad.text)
     assert (bad.code, found["ok"], len(found["problems"])) == (2, False, 2)
     assert any("unknown setting 'plane'" in problem for problem in found["problems"])
-    assert pano_mvs("check", "quality", "--json", "--watch").code == 2
     assert pano_mvs("check", "nowhere.yaml", "--json").code == 2
 
 
@@ -60,6 +59,8 @@ def test_a_text_is_laid_out() -> None:
     assert product.format_workflow(TEXT) == product.format_workflow(LAID_OUT) == LAID_OUT
     with pytest.raises(product.WorkflowError):
         product.format_workflow("stages: [")
+    with pytest.raises(product.UsageError, match=r"text='a\.yaml' is the name of a file: it must be the text"):
+        product.format_workflow("a.yaml")
     not_text: object = Path("a.yaml")
     with pytest.raises(product.UsageError, match="must be the text"):
         product.format_workflow(not_text)  # type: ignore[arg-type]

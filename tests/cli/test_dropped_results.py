@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import pano_mvs
+import pano_mvs as package
 from tests.cli.conftest import Command
 from tests.engine.rows import KEPT, TEMPORARY, Rows
 
@@ -36,6 +36,26 @@ def test_plan_states_what_was_dropped_and_what_would_be_computed_again(
     assert "first:0.txt and 3 more: dropped after an earlier run, and to be kept now" in said
 
 
+def test_the_forecast_of_disk_space_states_what_stays(
+    rows: Rows, own: tuple[str | Path, ...], pano_mvs: Command
+) -> None:
+    """It counted the results of temporary stages, which the run drops again."""
+    pano_mvs("run", *own, "--executor", "serial")
+    changed = ("--set", "first.value=6")
+    wf, out, cache = (rows.folder / name for name in ("wf.yaml", "out", "cache"))
+    planned = package.plan(wf, out=out, cache=cache, settings={"first.value": 6})
+    sizes = {one.stage: one.stored_bytes or 0.0 for one in planned.forecasts}
+    assert planned.dropped_bytes == sum(sizes[name] for name in TEMPORARY) > 0
+    assert planned.stored_bytes == sum(sizes.values()) - planned.dropped_bytes > 0
+    said = pano_mvs("plan", *own, *changed)
+    assert "more until it drops the results of temporary stages" in said.flat
+    assert [line.split("│")[-2].strip() for line in said.text.splitlines() if "│ first" in line] == ["dropped"]
+    for options in (("--keep", "all"), ("--until", "last")):
+        said = pano_mvs("plan", *own, *changed, *options)
+        assert "dropped" not in said.text.partition("first:")[0], "what is limited to a part drops nothing"
+        assert "temporary stages" not in said.flat
+
+
 def test_explain_says_that_a_result_was_dropped(rows: Rows, own: tuple[str | Path, ...], pano_mvs: Command) -> None:
     pano_mvs("run", *own, "--executor", "serial")
     said = pano_mvs("plan", *own, "--explain", "mean:1.txt").flat
@@ -55,10 +75,10 @@ def test_keep_all_is_an_option_and_an_argument(rows: Rows, own: tuple[str | Path
 
 def test_keep_all_in_python(rows: Rows) -> None:
     wf, out, cache = (rows.folder / name for name in ("wf.yaml", "out", "cache"))
-    pano_mvs.run(wf, out=out, cache=cache, executor="serial")
-    assert pano_mvs.plan(wf, out=out, cache=cache).units == 0
-    assert pano_mvs.plan(wf, out=out, cache=cache, keep="all").units == 4
-    assert pano_mvs.run(wf, out=out, cache=cache, executor="serial", keep="all").ok
+    package.run(wf, out=out, cache=cache, executor="serial")
+    assert package.plan(wf, out=out, cache=cache).units == 0
+    assert package.plan(wf, out=out, cache=cache, keep="all").units == 4
+    assert package.run(wf, out=out, cache=cache, executor="serial", keep="all").ok
     assert rows.kept() == {*KEPT, *TEMPORARY}
 
 

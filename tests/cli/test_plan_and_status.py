@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+import pano_mvs as package
 from pano_mvs.cli.app import app
 from pano_mvs.cli.check_command import watch_workflow
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
@@ -56,6 +57,32 @@ def test_a_plan_without_experience_says_so_and_gives_no_number(pano_mvs: Command
     assert (cells["images"], cells["scaled"], cells["difference"], cells["mean"]) == ("", "5", "all", "about 5")
     assert "cannot run" not in planned.text
     assert "time and disk space: unknown, because no earlier run" in planned.flat
+
+
+def test_a_plan_has_a_row_for_each_group_of_stages(pano_mvs: Command, here: Path) -> None:
+    """A plan of `quality` had 44 rows, of which a reader knows nine groups."""
+    own = "{use: toy.scale, in: {x: images}, by: "
+    (here / "grouped.yaml").write_text(
+        f"pano_mvs: 1\nextends: wf.yaml\nstages:\n  added:\n    stages:\n      again: {own}2}}\n      twice: {own}5}}\n"
+    )
+    command = ("plan", here / "grouped.yaml")
+    planned = pano_mvs(*command)
+    assert ["added", "again, twice", "", "", "10"] in rows_of(planned.text)
+    assert ["", "scaled", "", "", "5"] in rows_of(planned.text), "a stage in no group has a row of its own"
+    assert "11 stages in 1 group; pano-mvs plan --stages lists each" in planned.flat
+    pano_mvs("run", here / "grouped.yaml", "--executor", "serial")
+    planned = pano_mvs(*command, "--set", "twice.by=7")
+    assert ["added", "twice", "5", "5", ""] in rows_of(planned.text)
+    listed = pano_mvs(*command, "--stages")
+    assert {row[0] for row in rows_of(listed.text)} >= {"again", "twice", "scaled"}
+    assert "--stages" not in listed.text
+    assert package.plan(here / "grouped.yaml").groups == {"added": ("again", "twice")}
+    assert package.plan(here / "grouped.yaml", until="again").groups == {"added": ("again",)}
+
+
+def rows_of(text: str) -> list[list[str]]:
+    """Return the first five cells of each row of a table."""
+    return [[cell.strip() for cell in line.split("│")[1:6]] for line in text.splitlines() if line.startswith("│")]
 
 
 def test_units_that_cannot_run_have_a_column_if_there_are_any(pano_mvs: Command, here: Path) -> None:
@@ -371,8 +398,9 @@ GROUP_FILE = "pano_mvs: 1\nstages:\n  again: {use: toy.scale}\n"
 NEW_PLUGIN = 'from pano_mvs.api import Pairs, stage\n\n\n@stage(\'a.b\')\ndef f() -> Pairs:\n    """Nothing."""\n'
 
 
+@pytest.mark.parametrize("as_json", [False, True])
 def test_a_workflow_is_checked_again_after_each_change_of_its_files(
-    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
     """Also of a file that it extends, and of a plugin; a mistake does not end it, and Ctrl-C does."""
     monkeypatch.chdir(toy.folder)
@@ -381,6 +409,7 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
         lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scael")),
         lambda: toy.edit("wf.yaml", lambda text: text.replace("use: toy.scael", "use: toy.scale")),
         lambda: toy.edit("plug.py", lambda text: f"{text}\nraise ValueError('broken')\n"),
+        lambda: Path("child.yaml").unlink(),
     ]
 
     def sleep(_seconds: float) -> None:
@@ -389,11 +418,18 @@ def test_a_workflow_is_checked_again_after_each_change_of_its_files(
         changes.pop(0)()
 
     with pytest.raises(KeyboardInterrupt):
-        watch_workflow("child.yaml", [], None, sleep=sleep)
+        watch_workflow("child.yaml", [], None, as_json=as_json, sleep=sleep)
     shown = capsys.readouterr()
-    assert shown.out.count("no mistakes") == 2
-    assert "there is no stage 'toy.scael'" in shown.err
-    assert "broken" in shown.err
+    if as_json:
+        found = [json.loads(line) for line in shown.out.splitlines()]
+        assert [(one["ok"], one["stages"]) for one in found] == [(True, 9), (False, 0), (True, 9), *[(False, 0)] * 2]
+        assert not shown.err
+    else:
+        assert shown.out.count("no mistakes") == 2
+    mistakes = shown.out if as_json else shown.err
+    assert "there is no stage 'toy.scael'" in mistakes
+    assert "broken" in mistakes
+    assert "there is no workflow file 'child.yaml'" in mistakes
 
 
 @pytest.mark.parametrize(

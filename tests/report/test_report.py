@@ -181,6 +181,21 @@ def test_everything_that_is_known_is_said(out_dir: Path) -> None:
         assert text in page.words, text
 
 
+def test_groups_of_stages_are_listed_before_the_stages(out_dir: Path) -> None:
+    """The report of `quality` listed 44 stages, of which a reader knows nine groups."""
+    depth, ply = SUMMARY["stages"]
+    sky = {"name": "sky", "use": "filters.sky", "units": 4, "run": 4, "unit_seconds": 10.0}
+    grouped = [depth | {"group": "ranges"}, sky | {"group": "ranges"}, ply]
+    page = reported(out_dir, SUMMARY | {"stages": grouped})
+    assert_sound(page)
+    section = page.source.partition('<section id="stages">')[2].partition("</section>")[0]
+    above, _, below = section.partition("<summary>Each stage</summary>")
+    rows = [" ".join(re.sub(r"<[^>]+>", " ", row).split()) for row in above.split("<tr>")[2:]]
+    assert rows == ["ranges depth, sky 8 6 1 1 9 blocked 3 min", "ply 1 1 0 0"]
+    assert "depth.sweep" in below
+    assert "Each stage" not in reported(out_dir, SUMMARY).source, "a workflow without groups"
+
+
 def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir: Path) -> None:
     """On both maps, in its view card and in the table of all panoramas; nothing is where no camera is doubtful."""
     page = reported(out_dir, SUMMARY)

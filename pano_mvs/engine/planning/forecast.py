@@ -12,7 +12,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.text import error_text
 from pano_mvs.engine.cache.unit_times import CaptureSize, ExpectedUnit, UnitTimes
-from pano_mvs.engine.planning.plan import StagePlan
+from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions, StagePlan
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.stage import INDEX_PORT, StageSpec, place_of
 from pano_mvs.engine.workflows.wiring import Graph
@@ -32,6 +32,7 @@ class StageForecast:
     units: int | None = None  # expected number of units to compute; None if unknown
     unit_s: float | None = None  # expected seconds of one unit; None if no earlier run computed the stage
     unit_bytes: float | None = None  # expected bytes that a unit adds to the cache; None likewise
+    is_temporary: bool = False  # whether the run drops its results from the cache again
 
     @property
     def seconds(self) -> float | None:
@@ -42,10 +43,15 @@ class StageForecast:
 
     @property
     def stored_bytes(self) -> float | None:
-        """Expected bytes in the cache; None if unknown."""
+        """Expected bytes in the cache, until the run drops them if the stage is temporary; None if unknown."""
         if self.units == 0:
             return 0.0
         return None if self.units is None or self.unit_bytes is None else self.units * self.unit_bytes
+
+    @property
+    def kept_bytes(self) -> float | None:
+        """Expected bytes that stay in the cache after the run; None if unknown."""
+        return 0.0 if self.is_temporary else self.stored_bytes
 
 
 def settings_digest(entry: StageEntry) -> str:
@@ -91,9 +97,15 @@ class Experience:
 
 
 def forecast(
-    plans: Sequence[StagePlan], workflow: Workflow, graph: Graph, *, experience: Experience
+    plans: Sequence[StagePlan],
+    workflow: Workflow,
+    graph: Graph,
+    *,
+    experience: Experience,
+    options: RunOptions = DEFAULT_OPTIONS,
 ) -> tuple[StageForecast, ...]:
     """Return what each stage of a plan is expected to take, in the order of the plan."""
+    temporary = () if graph.is_part else options.temporary_stages(workflow, graph)  # a part of a run drops nothing
     found = []
     for plan in plans:
         entry, axis, edges = workflow.stages[plan.name], graph.axes[plan.name], graph.edges[plan.name]
@@ -107,6 +119,7 @@ def forecast(
                 units=experience.units(plan, entry, axis, index=index),
                 unit_s=None if unit is None else unit.seconds,
                 unit_bytes=None if unit is None else unit.stored_bytes,
+                is_temporary=plan.name in temporary,
             )
         )
     return tuple(found)

@@ -53,7 +53,8 @@ _IGNORED = frozenset(
 )
 
 _Import: TypeAlias = tuple[int, str, Sequence[str]]  # level, module ("" for `from .`), and names
-_Parsed: TypeAlias = tuple[str, Sequence[_Import]]  # digest of what a module executes, and its imports
+# digest of what a module executes, its imports, and digests of its functions by their names; "" for what is outside
+_Parsed: TypeAlias = tuple[str, Sequence[_Import], Mapping[str, str]]
 
 
 def stage_code(spec: StageSpec, params: Params) -> StageCode:
@@ -71,6 +72,36 @@ def stage_code(spec: StageSpec, params: Params) -> StageCode:
         digests[setting] = found[-1][0]
     libraries = library_versions(name for _, names in found for name in names)
     return StageCode(digest_from_value(digests) if len(digests) > 1 else digests[""], libraries)
+
+
+def code_functions(spec: StageSpec, params: Params) -> dict[str, Mapping[str, str]]:
+    """Return the files whose code counts for a stage, each with the digests of its functions, for a reason in words.
+
+    Nothing is returned for a stage whose code is compiled or in another environment.
+    """
+    file = Path(getattr(sys.modules.get(spec.function.__module__), "__file__", None) or "")
+    if spec.remote is not None or file.suffix != ".py":
+        return {}
+    paths: dict[str, Path] = {}
+    for path, own_digest in ((file, spec.code_digest), *((path, "") for path in registered_files(params).values())):
+        found, roots = _local_code(path), _Roots.of(path.resolve())
+        paths |= found.paths
+        if roots.package != _OURS:
+            ours, inner = _Roots(None, _OURS), _Code()
+            outer = _outer_of(found, roots, own_digest)
+            inner.collect([one for name in outer for one in ours.files(name)], ours)
+            paths |= inner.paths
+    return {
+        name: (_our_functions if path.is_relative_to(_OURS) else _functions_of)(path)
+        for name, path in sorted(paths.items())
+    }
+
+
+def _functions_of(path: Path) -> Mapping[str, str]:
+    return _parsed(path.read_text(encoding="utf-8-sig"))[2]
+
+
+_our_functions = cache(_functions_of)  # these do not change while a process runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,6 +270,7 @@ class _Code:
 
     files: dict[str, str] = field(default_factory=dict)  # name to the digest of what it executes
     outer: set[str] = field(default_factory=set)  # dotted names that they import from elsewhere
+    paths: dict[str, Path] = field(default_factory=dict)  # name to path
 
     def collect(self, pending: list[Path], roots: _Roots) -> None:
         """Add some files and what they import from the roots."""
@@ -250,6 +282,7 @@ class _Code:
             seen.add(path)
             name = roots.name_of(path)
             if not name.startswith(_LEFT_OUT) or name == _KEPT:
+                self.paths[name] = path
                 self.files[name], files, outer = (_our_module if roots.package == _OURS else _module)(path, roots)
                 pending += files - seen
                 self.outer |= outer
@@ -258,7 +291,7 @@ class _Code:
 def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
     """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
-        digest, imports = _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
+        digest, imports, _ = _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
     except SyntaxError as error:
         error.filename = str(path)
         raise
@@ -315,8 +348,30 @@ def _parsed(text: str) -> _Parsed:
                 case (ast.Module() | ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef()) as block:
                     if ast.get_docstring(block, clean=False) is not None:
                         block.body = block.body[1:] or [ast.Pass()]
-        known[key] = digest_from_bytes(ast.unparse(tree).encode()), imports
+        known[key] = digest_from_bytes(ast.unparse(tree).encode()), imports, _function_digests(tree)
     return known[key]
+
+
+def _function_digests(tree: ast.Module) -> dict[str, str]:
+    """Return a short digest of each function and method in a module, and of its other statements under ""."""
+    found: dict[str, str] = {}
+    rest: list[ast.stmt] = []
+    for node in tree.body:
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                found[name] = _short_digest([node])
+            case ast.ClassDef(name=name, body=body):
+                methods = [one for one in body if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)]
+                found |= {f"{name}.{one.name}": _short_digest([one]) for one in methods}
+                others = [one for one in body if one not in methods]
+                found[name] = _short_digest([*node.decorator_list, *node.bases, *node.keywords, *others])
+            case _:
+                rest.append(node)
+    return found | {"": _short_digest(rest)}
+
+
+def _short_digest(nodes: Sequence[ast.AST]) -> str:
+    return digest_from_bytes("\n".join(map(ast.unparse, nodes)).encode())[:12]
 
 
 def _imports_in(tree: ast.AST) -> Iterator[_Import]:

@@ -27,6 +27,14 @@ class StageGroup:
     stages: tuple[str, ...]  # in the order of the workflow
 
 
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """A stage that a later file or `--set` has removed, or a group."""
+
+    how: str  # such as "was removed with the group 'masks' (--set masks)"
+    use: object = None  # the registered stage; None for a group
+
+
 class _Kind(Enum):
     STAGE = auto()  # an entry of a stage
     BESIDE = auto()  # a group is named here, as a place for what follows
@@ -71,6 +79,7 @@ class MergedStages:
     group_files: list[WorkflowFile] = field(default_factory=list)  # those that were read for groups
     written: set[str] = field(default_factory=set)  # names of all stages that an entry describes, also a wrong one
     notes: list[str] = field(default_factory=list)  # what the user should know, such as a group without a name
+    removed: dict[str, Removed] = field(default_factory=dict)  # by name, also stages that a later entry has added again
     _groups: dict[str, _Group] = field(default_factory=dict)
     _first_file: dict[str, str] = field(default_factory=dict)  # stage to `shown_as` of the file that brought it
 
@@ -255,8 +264,13 @@ class MergedStages:
         if step.kind is _Kind.STAGE:
             self._apply_stage(step, file)
             return
+        verb = "removed" if step.kind is _Kind.REMOVE else "replaced"
+        if step.kind is _Kind.REMOVE:
+            self.removed[step.name] = Removed(f"was removed ({step.node.key_place})")
         for name in step.old:
-            self.stages.pop(name, None)
+            if (node := self.stages.pop(name, None)) is not None:
+                how = f"was {verb} with the group {step.name!r} ({step.node.key_place})"
+                self.removed[name] = Removed(how, node.value["use"].value)
             self._first_file.pop(name, None)
             if step.kind is _Kind.REMOVE:
                 self.group_of.pop(name, None)
@@ -277,6 +291,8 @@ class MergedStages:
                     "write it there, or give it another name",
                 )
                 return
+        if node.value is None and name in self.stages:
+            self.removed[name] = Removed(f"was removed ({node.key_place})", self.stages[name].value["use"].value)
         _merge_entry(self.stages, name, node, problems=self.problems)
         if name in self.stages:
             self._first_file.setdefault(name, file.shown_as)

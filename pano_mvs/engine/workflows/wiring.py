@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from graphlib import CycleError, TopologicalSorter
 
 from pano_mvs.core.errors import WorkflowError
-from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port, StageSpec
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
 
@@ -75,9 +75,18 @@ def wiring_problems(stages: Mapping[str, StageEntry], unknown: Collection[str] =
     return []
 
 
+def _remedy(entry: StageEntry, port: Port) -> str:
+    """Return what to do about an input that was removed."""
+    return f"name another stage by `{entry.name}: {{in: {{{port.name}: STAGE}}}}`, or remove {entry.name!r} as well"
+
+
 def _delivers(entry: StageEntry, port: Port) -> bool | None:
     """Return True if a stage feeds a port with its items, False if as a whole, None if it cannot feed it."""
-    output = entry.spec.output
+    return _delivered_by(entry.spec, port)
+
+
+def _delivered_by(spec: StageSpec, port: Port) -> bool | None:
+    output = spec.output
     if port.cardinality is Cardinality.ONE:
         return False if issubclass(output, port.kind) and output.axis in (Axis.ONE, None) else None
     if issubclass(output, port.kind) and output.axis is not Axis.ONE:
@@ -89,6 +98,7 @@ def _delivers(entry: StageEntry, port: Port) -> bool | None:
 class _Wirer:
     def __init__(self, workflow: Workflow, unknown: Collection[str]) -> None:
         self.stages = workflow.stages
+        self.workflow = workflow
         self.unknown = unknown
         self.broken: set[str] = set()
         self.problems: list[str] = []
@@ -119,9 +129,7 @@ class _Wirer:
         place = f"in.{port.name}"
         producer = self.stages.get(name)
         if producer is None:
-            close = get_close_matches(name, self.stages, n=1, cutoff=0.4)
-            hint = f"did you mean {close[0]!r}?" if close else f"stages: {', '.join(self.stages)}"
-            self._problem(entry, place, f"port {port.name!r}: there is no stage {name!r}; {hint}")
+            self._problem(entry, place, self._no_such_stage(entry, port, name))
             return None
         exploded = _delivers(producer, port)
         if exploded is None:
@@ -129,6 +137,18 @@ class _Wirer:
             self._problem(entry, place, f"port {port} cannot be fed by {name!r}, which produces {made}")
             return None
         return Edge(port, name, exploded)
+
+    def _no_such_stage(self, entry: StageEntry, port: Port, name: str) -> str:
+        """Return why a port cannot be fed by what its `in:` names."""
+        if name in self.workflow.groups:
+            stages = ", ".join(self.workflow.groups[name].stages)
+            return f"port {port.name!r}: {name!r} is a group of stages; name one of its stages: {stages}"
+        if removed := self.workflow.removed.get(name):
+            what = f"{'group' if removed.spec is None else 'stage'} {name!r} {removed.how}"
+            return f"stage {entry.name!r}: port {port.name!r}: {what}; {_remedy(entry, port)}"
+        close = get_close_matches(name, self.stages, n=1, cutoff=0.4)
+        hint = f"did you mean {close[0]!r}?" if close else f"stages: {', '.join(self.stages)}"
+        return f"port {port.name!r}: there is no stage {name!r}; {hint}"
 
     def _nearest(self, entry: StageEntry, port: Port) -> Edge | None:
         if self.unknown:
@@ -161,6 +181,13 @@ class _Wirer:
             name for name, stage in self.stages.items() if name != entry.name and _delivers(stage, port) is not None
         ]
         hint = f" ({', '.join(later)} below does: move it up or name it in `in:`)" if later else ""
+        gone = {
+            name: removed.how
+            for name, removed in self.workflow.removed.items()
+            if name not in self.stages and removed.spec is not None and _delivered_by(removed.spec, port) is not None
+        }
+        if gone and not later:
+            hint = f" ({'; '.join(f'stage {name!r} {how}' for name, how in gone.items())}): {_remedy(entry, port)}"
         need = "needs an index" if port.name == INDEX_PORT else "needs"
         return f"stage {entry.name!r} {need} {port}, but no earlier stage produces {port.kind.kind_name()}{hint}"
 

@@ -18,7 +18,7 @@ from pano_mvs.engine.stages.params import Params, files_of, takes_path
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest
-from pano_mvs.engine.workflows.merged_stages import MergedStages, StageGroup
+from pano_mvs.engine.workflows.merged_stages import MergedStages, Removed, StageGroup
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.workflows.workflow_file import WorkflowFile, WorkflowFilesReader, read_text
 
@@ -37,6 +37,14 @@ class StageEntry:
 
 
 @dataclass(frozen=True, slots=True)
+class RemovedStage:
+    """A stage that a workflow has no more, or a group of stages."""
+
+    how: str  # such as "was removed with the group 'masks' (--set masks)"
+    spec: StageSpec | None = None  # None for a group, or if no plugin offers the stage
+
+
+@dataclass(frozen=True, slots=True)
 class Workflow:
     """A validated workflow."""
 
@@ -50,6 +58,7 @@ class Workflow:
     warnings: tuple[str, ...] = ()  # such as why optional stages are missing
     files: tuple[Path, ...] = ()  # its file, those that it extends, and those of groups
     groups: Mapping[str, StageGroup] = field(default_factory=dict)  # by name, in order; a stage may be in none
+    removed: Mapping[str, RemovedStage] = field(default_factory=dict)  # stages and groups, by name
 
     @property
     def id(self) -> str:
@@ -123,7 +132,7 @@ class WorkflowReader:
         for file in (*merged.group_files, *files):
             self._load_plugins(file.root.value.get("plugins"))
         groups = merged.groups(list(entries))
-        applying = _Overrides(entries, groups, self.problems, self._load_plugin, self._params_of)
+        applying = _Overrides(entries, groups, merged.removed, self.problems, self._load_plugin, self._params_of)
         applying.apply(rest, images=images)
         if not entries and not self.problems.lines:
             self.problems.add(files[-1].root.place, "no stage is left")
@@ -133,6 +142,7 @@ class WorkflowReader:
             name: entry for name, node in entries.items() if (entry := self._stage(name, node, groups)) is not None
         }
         if self.problems.lines:
+            self._hint_at_vary(overrides)
             unknown = frozenset({*merged.written, *entries} - set(stages))
             raise InvalidWorkflowError(self.problems.lines, stages, unknown)
         root = files[-1].root
@@ -144,7 +154,11 @@ class WorkflowReader:
         text = "".join([files[-1].text, *below])
         paths = () if path is None else (*map(Path, others), path)
         warnings = (*merged.notes, *left_out)
-        return Workflow(name, path, text, stages, tuple(shown), self.plugins, warnings, paths, groups)
+        removed = {
+            name: RemovedStage(one.how, self.registry.stages.get(one.use) if isinstance(one.use, str) else None)
+            for name, one in merged.removed.items()
+        }
+        return Workflow(name, path, text, stages, tuple(shown), self.plugins, warnings, paths, groups, removed)
 
     def inherited(self, text: str, path: Path) -> tuple[dict[str, Located], frozenset[str]]:
         """Return the stages and the groups that a file has from other files, and load the plugins of all its files.
@@ -186,6 +200,10 @@ class WorkflowReader:
             if equals and target.strip() in groups and written.strip() in {"null", "~"}:
                 entry = Located(None, 0, 0, origin=origin)
                 merged.apply(file, {target.strip(): entry})
+            elif equals and key == "group" and name in groups and written.strip() in {"", "null", "~"}:
+                self.problems.add(
+                    origin, f"give the file of a group, or the name of a shipped one; {name}=null removes it"
+                )
             elif equals and key == "group" and name in groups and name not in merged.stages:
                 value = Located(written.strip(), 0, 0, origin=origin)
                 entry = Located({"group": value}, 0, 0, origin=origin)
@@ -194,6 +212,16 @@ class WorkflowReader:
                 rest.append(text)
         self.folders |= {one.shown_as: one.base for one in merged.group_files}
         return rest
+
+    def _hint_at_vary(self, overrides: Sequence[str]) -> None:
+        """Add to the errors about several values of a setting which command takes these."""
+        for text in overrides:
+            target, _, written = text.partition("=")
+            if "," not in written or written.strip().startswith(("[", "{", '"', "'")):
+                continue
+            hint = f". `pano-mvs vary --set {target.strip()}={written.strip()}` runs with each of these values"
+            lines = self.problems.lines
+            lines[:] = [f"{line}{hint}" if line.startswith(f"--set {target.strip()}:") else line for line in lines]
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:
@@ -368,6 +396,7 @@ class _Overrides:
 
     stages: dict[str, Located]
     groups: Mapping[str, StageGroup]
+    removed: dict[str, Removed]
     problems: Problems
     load_plugin: Callable[[Located], None]
     params_of: Callable[[Located], type[Params] | None]  # an entry to the model of its settings
@@ -410,6 +439,7 @@ class _Overrides:
         elif not is_stage:
             _replace(stages, stage, value)
         elif value.value is None:
+            self.removed[stage] = Removed(f"was removed (--set {stage})", stages[stage].value["use"].value)
             del stages[stage]
         else:
             problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {stage}=null removes the stage")

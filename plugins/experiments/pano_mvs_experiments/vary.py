@@ -390,6 +390,26 @@ def planned_units(experiment: Experiment) -> list[PlannedUnits]:
     return found
 
 
+def planned_json(experiment: Experiment, planned: Sequence[PlannedUnits]) -> dict[str, object]:
+    """Return what each run would compute as a JSON value."""
+    runs = [
+        {
+            "capture": each.run.capture,
+            "combination": each.run.combination,
+            "settings": {
+                target: value.shown for target, value in experiment.combinations[each.run.combination].items()
+            },
+            "seed": each.run.seed,
+            "out": str(each.run.session.out),
+            "cached": each.cached,
+            "units": each.units,
+            "bound": each.bound,
+        }
+        for each in planned
+    ]
+    return {"runs": runs, "dropped": dict(experiment.dropped), "units": sum(each.units for each in planned)}
+
+
 def _identities(session: Session) -> dict[str, str]:
     """Return a digest of each stage: of its settings, and of those of all stages that feed it."""
     found: dict[str, str] = {}

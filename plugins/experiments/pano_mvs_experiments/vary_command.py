@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -19,12 +19,11 @@ from pano_mvs.cli.completion import complete_setting
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.endings import ending_text, guarded
 from pano_mvs.cli.options import CacheOption, UntilOption, WorkflowArgument, takes_record
-from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import one_line, plural
 
 if TYPE_CHECKING:
     from pano_mvs.session.progress import Event, Progress
-    from pano_mvs_experiments.vary import Experiment, PlannedRun, VaryRequest
+    from pano_mvs_experiments.vary import Experiment, PlannedRun, PlannedUnits, VaryRequest
     from pano_mvs_experiments.vary_results import Variation, VariedRun
 
 # Options by the panel of the help in which they are listed.
@@ -120,7 +119,7 @@ def vary_settings(given: VaryArguments, options: Mapping[str, tuple[str, ...]] |
     from pano_mvs.cli.run.command import interrupted_by_termination
     from pano_mvs.session.observers import OBSERVERS
     from pano_mvs.session.running import Execution
-    from pano_mvs_experiments.vary import Watch, prepare, run_experiment
+    from pano_mvs_experiments.vary import Watch, planned_json, planned_units, prepare, run_experiment
 
     observers = {name: values for name, values in (options or {}).items() if name in OBSERVERS.names()}
     others = {name: values[0] for name, values in (options or {}).items() if name not in observers}
@@ -129,9 +128,11 @@ def vary_settings(given: VaryArguments, options: Mapping[str, tuple[str, ...]] |
     shown = Console(stderr=given.as_json)
     _print_counts(experiment, shown)
     if given.dry_run:
+        planned = planned_units(experiment)
         if given.as_json:
-            raise UsageError("--dry-run prints a table: leave out --json")
-        _print_plan(experiment, shown)
+            print_json(planned_json(experiment, planned))
+        else:
+            _print_plan(experiment, planned, shown)
         return
     watch = Watch(partial(_around, shown, len(experiment.runs)), partial(_print_end, shown))
     with interrupted_by_termination(), redirect_stdout(sys.stderr) if given.as_json else nullcontext():
@@ -183,10 +184,7 @@ def _print_counts(experiment: Experiment, console: Console) -> None:
     console.say(f"{text}: {total} {plural(total, 'run')}")
 
 
-def _print_plan(experiment: Experiment, console: Console) -> None:
-    from pano_mvs_experiments.vary import planned_units
-
-    planned = planned_units(experiment)
+def _print_plan(experiment: Experiment, planned: Sequence[PlannedUnits], console: Console) -> None:
     table = Table("capture", *map(escape, experiment.varied), "seed", "cached", "units to compute")
     for each in planned:
         combination = experiment.combinations[each.run.combination]

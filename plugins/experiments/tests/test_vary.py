@@ -482,7 +482,11 @@ def test_a_dry_run_shows_what_would_be_computed_and_writes_nothing(toy: Toy, pan
     rows = [line.split("│")[1:-1] for line in done.text.splitlines() if line.startswith("│")]
     assert [row[-1].strip() for row in rows] == ["0", "1", "up to 21", "up to 1"]
     assert "up to 23 units to compute" in done.text
-    assert vary(pano_mvs, toy, "--set", "scaled.by=2,3", "--dry-run", "--json").code == 2
+    done = vary(pano_mvs, toy, "--set", "scaled.by=2,3", "--set", "all.rng_seed=0,1", "--dry-run", "--json")
+    found = json.loads(done.text[done.text.index("{") :])
+    assert [(run["units"], run["bound"]) for run in found["runs"]] == [(0, ""), (1, ""), (21, "up to"), (1, "up to")]
+    assert found["units"] == 23
+    assert found["runs"][3]["settings"] == {"scaled.by": "3", "all.rng_seed": "1"}
 
 
 def test_vary_in_python_returns_records(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,7 +56,7 @@ def runs(
         shown.add_row(*(escape(cells[column]) for column in columns))
     console.show(shown)
     if hidden:
-        console.say(f"{hidden} more settings differ; --csv FILE and --json list them")
+        console.say(f"settings that differ and are not shown: {hidden}; --csv FILE and --json list them")
     for note in table.notes:
         console.say(f"note: {escape(note)}")
     for why_not in table.skipped:
@@ -86,8 +86,14 @@ def diff(
         print_json(found.to_json())
         return
     console = Console()
-    for line in found.lines():
-        console.say(escape(line))
+    for part in found.parts():
+        for line in [f"{part.title}:"] if part.rows else part.text if part.lines else [part.title]:
+            console.say(escape(line))
+        if part.rows:
+            shown = Table(*map(escape, part.columns))
+            for row in part.rows:
+                shown.add_row(*map(escape, row))
+            console.show(shown)
     if page is not None:
         console.say(f"page: {escape(str(page))}")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
 from pano_mvs.geometry import geodesic_angle
 from pano_mvs.geometry.pose_errors import align_centers, camera_extent
-from pano_mvs_lineage.range_changes import RangeChange, range_changes
+from pano_mvs.session.code_listing import changed_functions, read_code_listing
+from pano_mvs_lineage.range_changes import CLASSES, RangeChange, range_changes
 from pano_mvs_lineage.stored_runs import StoredRun
 
 # Cameras that moved less are counted, not listed: a global solve moves every camera a little.
@@ -59,6 +60,21 @@ class PoseChanges:
 
 
 @dataclass(frozen=True)
+class DiffPart:
+    """What differs in one respect, as lines, and as a table where there are many figures."""
+
+    title: str
+    lines: tuple[str, ...]
+    columns: tuple[str, ...] = ()  # of the table; empty if there is none
+    rows: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def text(self) -> list[str]:
+        """The title and the lines below it."""
+        return [f"{self.title}:", *(f"  {line}" for line in self.lines)]
+
+
+@dataclass(frozen=True)
 class RunDiff:
     """What differs between two runs; empty parts are equal."""
 
@@ -89,25 +105,34 @@ class RunDiff:
         plain: dict[str, Any] = _plain(values)
         return plain
 
-    def lines(self) -> list[str]:
-        """Return the differences as text, the most telling first."""
+    def parts(self) -> list[DiffPart]:
+        """Return the differences in parts, the most telling first; parts that are equal are left out."""
         if self.is_same:
             same = "the same settings, images, code and files"
-            return [f"{same}, as far as they could be compared:" if self.notes else same, *self.notes]
-        parts: list[tuple[str, list[str]]] = [
-            ("notes", list(self.notes)),
-            ("outcome", list(map(str, self.outcome))),
-            ("stages", list(map(str, self.stages))),
-            ("settings", list(map(str, self.settings))),
-            ("versions", list(map(str, self.versions))),
-            ("why units differ", [f"{stage}: {reason}" for stage, reason in self.reasons.items()]),
-            ("images", _image_lines(self.images)),
-            ("metrics", list(map(str, self.metrics))),
-            ("poses", _pose_lines(self.poses)),
-            ("ranges", [str(one) for one in self.ranges]),
-            ("files", _file_lines(self.files)),
+            return [DiffPart(f"{same}, as far as they could be compared" if self.notes else same, self.notes)]
+        reasons = tuple(f"{stage}: {reason}" for stage, reason in self.reasons.items())
+        parts = [
+            DiffPart("notes", self.notes),
+            DiffPart("outcome", tuple(map(str, self.outcome))),
+            DiffPart("stages", tuple(map(str, self.stages))),
+            DiffPart("settings", tuple(map(str, self.settings))),
+            DiffPart("versions", tuple(map(str, self.versions))),
+            DiffPart("why units differ", reasons),
+            DiffPart("images", tuple(_image_lines(self.images))),
+            DiffPart(
+                "metrics", tuple(map(str, self.metrics)), ("metric", "before", "after"), _metric_rows(self.metrics)
+            ),
+            DiffPart("poses", tuple(_pose_lines(self.poses))),
+            DiffPart("ranges", tuple(map(str, self.ranges)), _RANGE_COLUMNS, _range_rows(self.ranges)),
+            DiffPart("files", tuple(_file_lines(self.files))),
         ]
-        return [line for title, found in parts if found for line in (f"{title}:", *(f"  {each}" for each in found))]
+        return [part for part in parts if part.lines]
+
+    def lines(self) -> list[str]:
+        """Return the differences as text."""
+        if self.is_same and not self.notes:
+            return [self.parts()[0].title]
+        return [line for part in self.parts() for line in part.text]
 
 
 def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = None) -> RunDiff:
@@ -158,10 +183,11 @@ def diff(before: str | Path, after: str | Path, *, cache: str | Path | None = No
 def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
     """Return for each stage of both runs why its units are not the same; stages without a difference are left out.
 
-    A stage whose inputs alone differ names the stages that made these.
+    A stage whose inputs alone differ names the stages that made these. The order is that of the workflow.
     """
     found: dict[str, str] = {}
-    for stage in new.keys:
+    order = [outcome.name for outcome in new.summary.stages]
+    for stage in sorted(new.keys, key=lambda name: order.index(name) if name in order else len(order)):
         before, after = old.keys.get(stage), new.keys[stage]
         if before is None or before == after:
             continue
@@ -175,18 +201,33 @@ def reasons_between(old: StoredRun, new: StoredRun) -> dict[str, str]:
         for item in changed:
             one, other = old.record(stage, item), new.record(stage, item)
             if one is not None and other is not None:
-                parts.append(_reason(one.identity, other.identity, producers=new.producers.get(stage, {})))
+                codes = [
+                    read_code_listing(run.out, stage, str(record.identity.get("code")))
+                    for run, record in ((old, one), (new, other))
+                ]
+                functions = changed_functions(*codes)
+                parts.append(
+                    _reason(one.identity, other.identity, producers=new.producers.get(stage, {}), functions=functions)
+                )
                 break
         else:
             if changed:
                 parts.append("the cache no longer has what its units were made of")
-        if len(changed) < len(common):
+        if 0 < len(changed) < len(common):
             parts.append(f"{len(changed)} of {len(common)} units")
         found[stage] = "; ".join(part for part in parts if part)
     return found
 
 
-def _reason(before: Mapping[str, Any], after: Mapping[str, Any], *, producers: Mapping[str, str]) -> str:
+def _reason(
+    before: Mapping[str, Any], after: Mapping[str, Any], *, producers: Mapping[str, str], functions: Sequence[str]
+) -> str:
+    """Return why two identities of a unit differ.
+
+    Args:
+        producers: port to the stage that feeds it.
+        functions: those of its code that differ, by file, as far as they are known.
+    """
     parts = []
     if before.get("stage") != after.get("stage"):
         return f"stage {before.get('stage')} → {after.get('stage')}"
@@ -195,7 +236,8 @@ def _reason(before: Mapping[str, Any], after: Mapping[str, Any], *, producers: M
     if before.get("version") != after.get("version"):
         parts.append(f"version {before.get('version')} → {after.get('version')}")
     if before.get("code") != after.get("code"):
-        parts.append(f"code of {after.get('stage')}")
+        which = f" ({shortened_list(list(functions), 8)})" if functions else ""
+        parts.append(f"code of {after.get('stage')}{which}")
     parts += [f"library {change}" for change in _changes(before.get("libraries", {}), after.get("libraries", {}))]
     parts += [f"kind {change}" for change in _changes(before.get("kinds", {}), after.get("kinds", {}))]
     inputs = _changes(before.get("inputs", {}), after.get("inputs", {}))
@@ -340,6 +382,26 @@ def _image_lines(images: tuple[Change, ...]) -> list[str]:
         ("other content", [one.name for one in images if None not in (one.before, one.after)]),
     )
     return [f"{what}: {shortened_list(names, 8)}" for what, names in parts if names]
+
+
+def _metric_rows(metrics: tuple[Change, ...]) -> tuple[tuple[str, ...], ...]:
+    return tuple((one.name, _text(one.before), _text(one.after)) for one in metrics)
+
+
+_RANGE_COLUMNS = ("view", "differ by over 1 %", *CLASSES, "only before", "only after")
+
+
+def _range_rows(ranges: tuple[RangeChange, ...]) -> tuple[tuple[str, ...], ...]:
+    return tuple(
+        (
+            one.name,
+            f"{one.changed:.1%}",
+            *(f"{one.by_class[name]:.1%}" if name in one.by_class else "–" for name in CLASSES),
+            f"{one.only_before:.1%}",
+            f"{one.only_after:.1%}",
+        )
+        for one in ranges
+    )
 
 
 def _file_lines(files: tuple[Change, ...]) -> list[str]:

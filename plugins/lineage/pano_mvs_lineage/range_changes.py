@@ -17,7 +17,7 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, W
 from pano_mvs_lineage.stored_runs import StoredRun
 
 LIMIT = 0.01  # a range that differs by more than this share counts as changed
-_CLASSES = {"confirmed": CONSISTENT_CONFIDENCE, "seen": WEAK_CONFIDENCE, "filled": FILLED_CONFIDENCE}
+CLASSES = {"confirmed": CONSISTENT_CONFIDENCE, "seen": WEAK_CONFIDENCE, "filled": FILLED_CONFIDENCE}
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def compare_ranges(
     wrong = both & (difference > LIMIT)
     by_class = {}
     if confidence is not None:
-        for what, (least, most) in _CLASSES.items():
+        for what, (least, most) in CLASSES.items():
             here = both & (confidence >= least) & (confidence <= most)
             if here.any():
                 by_class[what] = _share(wrong & here, here, weight)

@@ -10,6 +10,7 @@ from typing import Any
 
 from pano_mvs.core.errors import InputError, PanoMvsError, StoreError
 from pano_mvs.core.paths import children, is_file, is_folder, resolved
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
@@ -123,6 +124,9 @@ class StoredRun:
     @property
     def unlisted(self) -> str:
         """A note on what run.json does not list; "" if it lists all."""
+        if self.summary.merged is not None:
+            blocks = shortened_list(list(map(str, self.summary.merged.blocks)))
+            return f"{self.out} was merged from blocks; their runs state images, settings and versions: {blocks}"
         found = {"images": self.summary.inputs, "versions of libraries": self.summary.versions}
         lacking = " and no ".join(what for what, values in found.items() if not values)
         if not lacking:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Any
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import is_of_the_run
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import children, is_file, resolved
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.dropping import dropping_after
@@ -26,6 +27,9 @@ from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions, reopen
 from pano_mvs_lineage.diff import digests_in
 from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
+
+REPORT = "report.html"
+_COMMANDS = {"ro-crate-metadata.json": "crate"}  # what a command writes into the folder of a run
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class UnitOrigin:
     def label(self) -> str:
         """`STAGE:ITEM`, or `STAGE` if the stage has one unit."""
         return f"{self.stage}:{self.item}" if self.item else self.stage
+
+    @property
+    def what(self) -> str:
+        """The registered stage, and the group of stages that it is in."""
+        return f"{self.use}, in {self.group}" if self.group else self.use
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,7 @@ class FileOrigin:
         return asdict(self) | {"file": str(self.file), "out": str(self.out)}
 
     def lines(self) -> list[str]:
-        """Return the origin as text."""
+        """Return the origin as text: the unit that made the file, and a line for each stage that it depends on."""
         what = f"made by pano-mvs {self.command} from" if self.command else f"{self.name} of"
         lines = [
             f"{self.file}: {what} the run into {self.out}",
@@ -78,12 +87,19 @@ class FileOrigin:
         ]
         if self.was_changed:
             lines.append("the file has other bytes than the run wrote: it was changed since")
-        for unit in self.units:
-            settings = ", ".join(f"{name}={value}" for name, value in unit.settings.items()) if unit.depth == 0 else ""
-            use = f"{unit.use}, in {unit.group}" if unit.group else unit.use
-            lines.append(f"{'  ' * min(unit.depth, 1)}{unit.label} ({use}), {unit.seconds:.2f} s, {unit.key[:12]}")
+        for unit in self.units[:1]:  # the one that made the file
+            settings = ", ".join(f"{name}={value}" for name, value in unit.settings.items())
+            lines.append(f"{unit.label} ({unit.what}), {unit.seconds:.2f} s, {unit.key[:12]}")
             lines += [f"  settings: {settings}"] if settings else []
-            lines += [f"  code: {unit.code}"] if unit.depth == 0 and unit.code else []
+            lines += [f"  code: {unit.code}"] if unit.code else []
+        by_stage: dict[str, list[UnitOrigin]] = {}
+        for unit in self.units[1:]:
+            by_stage.setdefault(unit.stage, []).append(unit)
+        for stage, units in by_stage.items():
+            seconds = math.fsum(unit.seconds for unit in units)
+            which = f"{units[0].label} ({units[0].what})" if len(units) == 1 else f"{stage} ({units[0].what})"
+            key = units[0].key[:12] if len(units) == 1 else f"{len(units)} units"
+            lines.append(f"  {which}, {seconds:.2f} s, {key}")
         images = ", ".join(Path(path).name for path in self.images)
         lines.append(f"images: {images or 'run.json does not list them'}")
         return [*lines, *self.notes]
@@ -94,9 +110,9 @@ def why(
 ) -> FileOrigin:
     """Return where a delivered file comes from: its run, the unit that made it, and all that this depends on.
 
-    A file in the output folder of a run is found by its place. One that was copied elsewhere is found by its content
-    among the runs in the folders `runs`. A file of a shared page or an experiment leads to the runs that it was made
-    from, which are looked for there as well.
+    A file in the output folder of a run is found by its place. One that was copied or renamed is found by its content:
+    in the run in whose folder it lies, and in the runs, shared pages and experiments in the folders `runs`. A file of a
+    page or an experiment leads to the runs that it was made from, which are looked for there as well.
 
     >>> import pano_mvs
     >>> pano_mvs.why("out/range/000.tiff").units[0].label  # doctest: +SKIP
@@ -115,30 +131,128 @@ def why(
     root = None if cache is None else Path(cache)
     place = _folder_above(path)
     made_by = Origin.read(place) if place is not None and not is_file(place / RUN_JSON) else None
+    searched = as_paths(runs) if runs else []
     if place is not None and made_by is not None:
-        return _derived(path, place, made_by, as_paths(runs) if runs else [], root)
+        return _derived(
+            path, path.absolute().relative_to(place.absolute()), made_by, folder=place, searched=searched, root=root
+        )
+    digest = digest_from_file(path)
     if place is not None:
         run, name = StoredRun.open(place, root), path.absolute().relative_to(place.absolute()).as_posix()
+        if run.summary.merged is not None:
+            return _merged(path, name, run, root)
         if name in run.summary.files:
-            return _origin(path, name, run, was_changed=digest_from_file(path) != run.summary.files[name])
-        if is_of_the_run(name):
-            when = "during" if name.startswith("logs/") else "at the end of"
-            note = f"{name} is written by the run itself, {when} each run, from the results of all stages"
-            return _origin(path, name, run, note=note)
+            return _origin(path, name, run, was_changed=digest != run.summary.files[name])
+        if found := _beside(path, name, run) or _delivered(path, digest, run):
+            return found
         if not runs:
             raise InputError(f"{path}: the run into {place} has not written this file, or an earlier run has")
-    digest = digest_from_file(path)
-    searched = as_paths(runs) if runs else [Path()]
-    for out in find_runs(searched):
-        try:
-            run = StoredRun.open(out, root)
-        except InputError:
-            continue
-        for name, own in run.summary.files.items():
-            if own == digest:
-                return _origin(path, name, run)
-    where = ", ".join(map(str, searched)) if runs else "the current folder"
+    return _by_content(path, digest, searched, root)
+
+
+def _by_content(path: Path, digest: str, searched: list[Path], root: Path | None) -> FileOrigin:
+    """Return the origin of a file that was copied: the same bytes are looked for in folders.
+
+    Args:
+        searched: the folders; empty for the current one.
+
+    Raises:
+        InputError: if no file there has the same content.
+    """
+    below = searched or [Path()]
+    opened = list(_readable(below, root))
+    for run in opened:
+        if found := _delivered(path, digest, run):
+            return found
+    for run in opened:
+        for name in (RUN_JSON, REPORT, *_COMMANDS, *(f"logs/{log.name}" for log in children(run.out / "logs"))):
+            found = _beside(path, name, run) if _is_copy(path, digest, run.out / name) else None
+            if found is not None:
+                return found
+        if run.summary.merged is not None:
+            copied = next((one for one in _files_below(run.out, is_run=True) if _is_copy(path, digest, one)), None)
+            if copied is not None:
+                return _merged(path, copied.relative_to(run.out).as_posix(), run, root)
+    for folder in _folders_of_commands(below):
+        made_by = Origin.read(folder)
+        copied = next((one for one in _files_below(folder) if _is_copy(path, digest, one)), None)
+        if made_by is not None and copied is not None:
+            return _derived(path, copied.relative_to(folder), made_by, folder=folder, searched=searched, root=root)
+    where = ", ".join(map(str, searched)) or "the current folder"
     raise InputError(f"{path}: no run in {where} has written a file with this content. Name its folder with --runs")
+
+
+def _delivered(path: Path, digest: str, run: StoredRun) -> FileOrigin | None:
+    """Return the origin of a copy of a file that a run delivered; None if the run delivered no such content."""
+    names = [name for name, own in run.summary.files.items() if own == digest]
+    if not names:
+        return None
+    others = f"other files of the run have the same content: {shortened_list(names[1:])}" if names[1:] else ""
+    found = _origin(path, names[0], run)
+    return replace(found, notes=(*found.notes, others)) if others else found
+
+
+def _beside(path: Path, name: str, run: StoredRun) -> FileOrigin | None:
+    """Return the origin of a file in the folder of a run that no unit made; None if it is unknown."""
+    if is_of_the_run(name):
+        when = "during" if name.startswith("logs/") else "at the end of"
+        note = f"{name} is written by the run itself, {when} each run, from the results of all stages"
+        return _origin(path, name, run, note=note)
+    if name in _COMMANDS:
+        found = _origin(path, name, run, note=f"{name} describes the whole run; ask about a file of it for its units")
+        return replace(found, command=_COMMANDS[name])
+    return None
+
+
+def _is_copy(path: Path, digest: str, other: Path) -> bool:
+    """Return whether another file has the same content."""
+    if not is_file(other) or other.stat().st_size != path.stat().st_size:
+        return False
+    return digest_from_file(other) == digest
+
+
+def _folders_of_commands(folders: Iterable[Path]) -> Iterator[Path]:
+    """Yield the folders below some that a command made from runs."""
+    for top in folders:
+        for folder, names, files in os.walk(top):
+            names[:] = [name for name in names if not name.startswith(".")]
+            if ORIGIN in files:
+                yield Path(folder)
+
+
+def _merged(path: Path, name: str, run: StoredRun, root: Path | None) -> FileOrigin:
+    """Return the origin of a file in the folder of a merged run: the runs of its blocks."""
+    folders = run.summary.merged.blocks if run.summary.merged is not None else ()
+    images: dict[tuple[str, str], str] = {}  # blocks share images, each by a link of its own
+    for block in _readable([Path(folder) for folder in folders], root):
+        for image, digest in block.summary.inputs.items():
+            images.setdefault((Path(image).name, digest), image)
+    note = f"merged from {len(folders)} {plural(len(folders), 'block')}: {shortened_list(list(map(str, folders)))}"
+    return FileOrigin(
+        path,
+        name,
+        run.out,
+        workflow=run.summary.workflow.name,
+        started=run.summary.started,
+        version=run.summary.version,
+        units=(),
+        images={image: digest for (_, digest), image in images.items()},
+        notes=(f"{note}; ask about a file of a block for its units",),
+        command="merge",
+    )
+
+
+def _files_below(folder: Path, *, is_run: bool = False) -> Iterator[Path]:
+    """Yield the files in a folder that a command made, without those of the runs in it.
+
+    Args:
+        is_run: whether the folder itself is that of a run.
+    """
+    for inner, names, files in os.walk(folder):
+        if RUN_JSON in files and not (is_run and Path(inner) == folder):
+            names.clear()
+            continue
+        yield from (Path(inner, name) for name in files if not name.startswith("."))
 
 
 @dataclass(frozen=True)
@@ -187,17 +301,20 @@ def _folder_above(path: Path) -> Path | None:
     return next((folder for folder in folders if is_file(folder / RUN_JSON) or is_file(folder / ORIGIN)), None)
 
 
-def _derived(path: Path, folder: Path, origin: Origin, searched: list[Path], root: Path | None) -> FileOrigin:
+def _derived(
+    path: Path, name: Path, origin: Origin, *, folder: Path, searched: list[Path], root: Path | None
+) -> FileOrigin:
     """Return the origin of a file that a command made from runs.
 
     Args:
-        searched: folders in which the runs are looked for; if there is none, the current folder, or the folder of the
-            file if its runs lie below it.
+        name: of the file in the folder of the command.
+        folder: that the command wrote; an experiment has its runs below it.
+        searched: folders in which the runs of a page are looked for; if there is none, the current folder.
 
     Raises:
         InputError: if none of the runs is found.
     """
-    below = searched or ([Path()] if origin.runs else [folder])
+    below = (searched or [Path()]) if origin.runs else [folder]
     runs = [run for run in _readable(below, root) if not origin.runs or RunName.of(run.summary) in origin.runs]
     if not runs:
         which = ", ".join(f"{run.workflow}, started {run.started}" for run in origin.runs)
@@ -209,10 +326,9 @@ def _derived(path: Path, folder: Path, origin: Origin, searched: list[Path], roo
     images = {image: digest for run in runs for image, digest in run.summary.inputs.items()}
     outs = shortened_list([str(run.out) for run in runs])
     note = f"made from {len(runs)} {plural(len(runs), 'run')}: {outs}; ask about a file of a run for its units"
-    name = path.absolute().relative_to(folder).as_posix()
     return FileOrigin(
         path,
-        name,
+        name.as_posix(),
         first.out,
         workflow=first.summary.workflow.name,
         started=first.summary.started,

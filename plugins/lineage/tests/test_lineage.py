@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_lineage.diff import Change, PoseChanges, _images, diff
+from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, diff
 from pano_mvs_lineage.page import diff_page
 from pano_mvs_lineage.range_changes import compare_ranges
 from pano_mvs_lineage.runs import runs
@@ -19,6 +19,7 @@ from pano_mvs_lineage.why import repeat, why
 import pano_mvs as package
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.results.origin import Origin, RunName
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
@@ -119,8 +120,35 @@ def test_images_and_code_that_differ_are_reasons(toy: Toy) -> None:
     second = run_into(toy, "second")
     found = diff(first, second)
     assert [change.name for change in found.images] == ["1.txt"]
-    assert "code of toy.scale" in found.reasons["scaled"]
+    assert "code of toy.scale (plug.py: scale)" in found.reasons["scaled"]
     assert any("other content: 1.txt" in line for line in found.lines())
+
+
+def test_images_that_were_added_are_counted_alone(toy: Toy) -> None:
+    """It said that 0 of 5 units differ."""
+    first = run_into(toy, "first")
+    toy.number("6.txt", "8")
+    assert diff(first, run_into(toy, "second")).reasons["images"] == "1 unit more"
+
+
+def test_the_functions_that_differ_are_named(toy: Toy) -> None:
+    """Only the stage was named, whose code are all modules that it imports."""
+    first = run_into(toy, "first")
+    toy.edit("helper.py", lambda text: text.replace("return 2 * x", "return x * 2") + "\nLIMIT = 3\n")
+    second = run_into(toy, "second")
+    assert diff(first, second).reasons["scaled"] == "code of toy.scale (helper.py: outside of functions, double)"
+    toy.edit("helper.py", lambda text: f"# a comment\n{text}")
+    assert diff(second, run_into(toy, "third")).is_same
+    (second / "logs" / "code.json").write_text("[]")
+    assert diff(first, second).reasons["scaled"] == "code of toy.scale"
+
+
+def test_reasons_are_in_the_order_of_the_workflow(two: tuple[Toy, Path, Path]) -> None:
+    _, first, second = two
+    stages = [stage.name for stage in package.load(second).summary.stages]
+    reasons = list(diff(first, second).reasons)
+    assert len(reasons) > 2
+    assert reasons == [name for name in stages if name in reasons] != sorted(reasons)
 
 
 def test_images_of_the_same_name_in_two_folders_are_two(two: tuple[Toy, Path, Path]) -> None:
@@ -280,6 +308,77 @@ def test_a_file_leads_back_to_its_unit_and_to_the_images(two: tuple[Toy, Path, P
     assert why(first / name).was_changed
 
 
+def test_a_file_that_was_renamed_in_its_folder_is_found_by_its_content(two: tuple[Toy, Path, Path]) -> None:
+    """It was refused, as a file that the run has not written."""
+    _, first, _ = two
+    name = next(iter(package.load(first).summary.files))
+    renamed = (first / name).rename(first / "mine.txt")
+    assert (why(renamed).name, why(renamed).units) == (name, why(shutil.copy(renamed, first / name)).units)
+
+
+def test_copies_of_what_no_unit_made_are_found_by_their_content(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """Only files that units made were found: not the report, run.json, the events, or a page that somebody was sent."""
+    toy, first, _ = two
+    (first / "ro-crate-metadata.json").write_text("a crate of the first run")
+    page = toy.folder / "runs" / "page"
+    page.mkdir()
+    (page / "page.html").write_text("a page about the first run")
+    Origin("share", (RunName.of(package.load(first).summary),)).write(page)
+    made = [
+        first / "run.json",
+        first / "report.html",
+        first / "logs" / "events.jsonl",
+        first / "ro-crate-metadata.json",
+    ]
+    for file in (*made, page / "page.html"):
+        copied = shutil.copy(file, tmp_path / f"copy{file.suffix}")
+        found = why(copied, runs=toy.folder / "runs")
+        assert (found.file, Path(found.name).name, found.units) == (copied, file.name, ())
+        assert (found.out, bool(found.notes)) == (first, True)
+        assert found.command == {"page.html": "share", "ro-crate-metadata.json": "crate"}.get(file.name, "")
+    (tmp_path / "empty").touch()
+    with pytest.raises(InputError, match="has written a file with this content"):
+        why(tmp_path / "empty", runs=toy.folder / "runs")
+
+
+def test_a_file_of_a_merged_run_leads_to_its_blocks(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """It was refused, as a file that the run has not written."""
+    _, first, second = two
+    merged = first.parent / "merged"
+    merged.mkdir()
+    (merged / "run.json").write_text(json.dumps({"stages": [], "merged": {"blocks": [str(first), str(second)]}}))
+    (merged / "cloud.ply").write_text("a merged cloud")
+    for file in (merged / "cloud.ply", Path(shutil.copy(merged / "cloud.ply", tmp_path / "copy.ply"))):
+        found = why(file, runs=() if file.parent == merged else merged)
+        assert (found.name, found.out, found.command, found.units) == ("cloud.ply", merged, "merge", ())
+        assert found.notes[0].startswith(f"merged from 2 blocks: {first}, {second}")
+        assert found.images == dict(package.load(first).summary.inputs)
+    notes = diff(merged, first).notes
+    assert any(note.startswith(f"{merged} was merged from blocks") for note in notes)
+
+
+def test_files_of_the_same_content_are_named(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    _, first, _ = two
+    run = StoredRun.open(first)
+    name, digest = next(iter(run.summary.files.items()))
+    files = {**run.summary.files, "other/place.txt": digest}
+    (first / "run.json").write_text(run.summary.model_copy(update={"files": files}).model_dump_json())
+    found = why(shutil.copy(first / name, tmp_path / "copy"), runs=first)
+    assert found.notes == ("other files of the run have the same content: other/place.txt",)
+    assert not why(first / name).notes
+
+
+def test_units_of_one_stage_take_one_line(two: tuple[Toy, Path, Path]) -> None:
+    """A file of a capture of nine images had a list of 127 units."""
+    _, first, _ = two
+    origin = why(first / next(iter(package.load(first).summary.files)))
+    lines = [line for line in origin.lines() if line.startswith("  images")]
+    several = [unit for unit in origin.units if unit.stage == "images"]
+    assert len(several) > 1
+    assert len(lines) == 1
+    assert lines[0].endswith(f"{len(several)} units")
+
+
 def test_what_no_run_has_written_is_refused(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
     toy, first, _ = two
     (tmp_path / "other").write_text("nothing")
@@ -320,6 +419,20 @@ def test_the_commands_print_text_and_json(two: tuple[Toy, Path, Path], pano_mvs:
     assert "the same bytes" in again.flat
     assert json.loads(pano_mvs("why", first / name, "--json").text)["units"][0]["depth"] == 0
     assert pano_mvs("diff", first, toy.folder / "nowhere").code == 2
+
+
+def test_figures_are_tables() -> None:
+    """They were lines of text, in which no column could be compared."""
+    change = compare_ranges("a.png", np.full((8, 16), 2.0, np.float32), np.full((8, 16), 2.1, np.float32))
+    found = RunDiff(
+        Path("a"), Path("b"), settings=(Change("s.x", 1, 2),), metrics=(Change("s.y", 0.5, None),), ranges=(change,)
+    )
+    settings, metrics, ranges = found.parts()
+    assert (settings.rows, settings.lines) == ((), ("s.x: 1 → 2",))
+    assert (metrics.columns, metrics.rows) == (("metric", "before", "after"), (("s.y", "0.5", "–"),))
+    assert ranges.columns == ("view", "differ by over 1 %", "confirmed", "seen", "filled", "only before", "only after")
+    assert ranges.rows == (("a.png", "100.0%", "–", "–", "–", "0.0%", "0.0%"),)
+    assert found.lines()[2:4] == ["metrics:", "  s.y: 0.5 → –"]
 
 
 def test_ranges_are_compared_by_class_and_by_solid_angle() -> None:
@@ -366,6 +479,8 @@ def test_two_real_runs_are_compared_with_poses_and_ranges(rendered: Path, tmp_pa
     page = diff_page(found)
     assert page.count("<figure>") == 4
     assert page.count("data:image/jpeg") == 12
+    assert page.count('<div class="beside">') == 4
+    assert page.count("<td>000.png</td>") == 1
     table = runs([tmp_path])
     assert table.settings == ("depth.planes",)
     assert "scores.median_pair_error_deg" in table.metrics

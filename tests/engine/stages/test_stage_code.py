@@ -195,7 +195,7 @@ def test_what_another_version_parsed_is_not_read(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(stage_code_module, "_kept_counts", [])
     known = stage_code_module._known_parsed
     known.cache_clear()
-    known()["text"] = "digest", ()
+    known()["text"] = "digest", (), {}
     stage_code_module._keep_parsed()
     place, written = stage_code_module._kept_place(), stage_code_module._kept_place().stat().st_mtime_ns
     known.cache_clear()

@@ -281,12 +281,59 @@ def test_mistakes_in_groups_are_reported_with_their_place(grouped: Toy, stages: 
         ("means.retries=2", "'means' is a group of stages; set a setting of one of them: views, mean"),
         ("means.group=nothing.yaml", "--set means.group: group: there is no file"),
         ("nothing.by=2", "no stage 'nothing'"),
+        ("numbers.group=null", "numbers.group: give the file of a group, or the name of a shipped one; numbers=null"),
         ("means=3", "write STAGE.PARAM=VALUE"),
     ],
 )
 def test_mistakes_in_options_about_groups(grouped: Toy, override: str, what: str) -> None:
     found = problems(grouped, CHILD, override)
     assert any(what in line for line in found), found
+
+
+@pytest.mark.parametrize(
+    ("stages", "overrides", "what"),
+    [
+        (
+            "{each: {}}",
+            ("numbers=null",),
+            "stage 'difference': port 'ends': stage 'scaled' was removed with the group 'numbers' "
+            "(--set numbers); name another stage by `difference: {in: {ends: STAGE}}`, or remove 'difference' as well",
+        ),
+        ("{each: {}}", ("scaled=null",), "stage 'mean': port 'own': stage 'scaled' was removed (--set scaled)"),
+        ("{scaled: null}", (), "stage 'mean': port 'own': stage 'scaled' was removed (child.yaml:4:10)"),
+        (
+            "{numbers: {group: other.yaml}}",
+            (),
+            "stage 'mean': port 'own': stage 'scaled' was replaced with the group 'numbers' (child.yaml:4:10)",
+        ),
+        (
+            "{means: null, all: {in: {differences: means}}}",
+            (),
+            "port 'differences': group 'means' was removed (child.yaml:4:10)",
+        ),
+        (
+            "{all: {in: {differences: numbers}}}",
+            (),
+            "port 'differences': 'numbers' is a group of stages; name one of its stages: images",
+        ),
+        (
+            "{all: null, each: null, mean: null}",
+            ("pairs=null",),
+            "stage 'difference' needs an index index: One[Pairs], but no earlier stage produces Pairs (stage 'pairs' "
+            "was removed (--set pairs)): name another stage by `difference: {in: {index: STAGE}}`",
+        ),
+    ],
+)
+def test_an_input_that_was_removed_is_named_with_the_place(
+    grouped: Toy, stages: str, overrides: tuple[str, ...], what: str
+) -> None:
+    """It was called a stage that does not exist, with another one of a similar name."""
+    (grouped.folder / "other.yaml").write_text("pano_mvs: 1\nstages: {images: {use: toy.source, path: capture}}\n")
+    workflow = load(grouped, f"{CHILD}stages: {stages}\n", *overrides)
+    with pytest.raises(WorkflowError) as caught:
+        wire(workflow)
+    said = [line.replace(f"{grouped.folder}/", "") for line in caught.value.problems]
+    assert any(what in line for line in said), said
 
 
 def test_options_take_the_names_of_groups(grouped: Toy) -> None:

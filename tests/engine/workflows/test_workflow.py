@@ -509,6 +509,7 @@ def test_paths_in_files_and_on_the_command_line(
         ("many.gate.x.mim=1", "unknown setting 'gate.x.mim'."),
         ("many.to=../up", "--set many.to: stage 'many': to: must be a folder inside the output folder"),
         ("many.memory=lots", "memory: must be a size such as 500MB"),
+        ("many.limit=1,2", '(got "1,2"). `pano-mvs vary --set many.limit=1,2` runs with each of these values'),
         pytest.param(f"many.memory={'9' * 400}GB", "memory: must be at most 9223372.0 TB", id="many.memory=999…GB"),
         ("many.file=gone.txt", "gone.txt does not exist"),
     ],
