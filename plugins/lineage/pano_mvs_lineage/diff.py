@@ -293,11 +293,12 @@ def _named(old: StoredRun, new: StoredRun) -> tuple[dict[str, str], dict[str, st
     if all(len({Path(path).name for path in inputs}) == len(inputs) for inputs in both):
         before, after = ({Path(path).name: digest for path, digest in inputs.items()} for inputs in both)
     else:
-        before, after = (_below_common_folder(inputs) for inputs in both)
+        before, after = (below_common_folder(inputs) for inputs in both)
     return before, after
 
 
-def _below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
+def below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
+    """Return the paths of files below the folder that all share, each with its digest."""
     folders = [Path(path).parent for path in inputs]
     above = [one for first in folders[:1] for one in (first, *first.parents)]
     shared = next((one for one in above if all(folder.is_relative_to(one) for folder in folders)), Path())

@@ -17,6 +17,7 @@ from pano_mvs_lineage.stored_runs import StoredRun
 from pano_mvs_lineage.why import repeat, why
 
 import pano_mvs as package
+from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.results.origin import Origin, RunName
@@ -377,6 +378,42 @@ def test_units_of_one_stage_take_one_line(two: tuple[Toy, Path, Path]) -> None:
     assert len(several) > 1
     assert len(lines) == 1
     assert lines[0].endswith(f"{len(several)} units")
+
+
+def test_many_images_are_named_below_their_folder_and_shortened(two: tuple[Toy, Path, Path]) -> None:
+    """The tiles of a tour were named without their folders, all of them: "0.png, 1.png, 0.png, …"."""
+    _, first, _ = two
+    origin = why(first / next(iter(package.load(first).summary.files)))
+    tiles = {f"/site/tiles/{scene}/{row}.png": "" for scene in ("hall", "kitchen") for row in range(9)}
+    (line,) = (line for line in replace(origin, images=tiles).lines() if line.startswith("images: "))
+    assert line.startswith("images: hall/0.png, hall/1.png, ")
+    assert line.endswith(" … (18 in all)")
+
+
+def test_a_search_passes_files_that_cannot_be_read(
+    two: tuple[Toy, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One file without permission, of the same size, ended the search in all folders."""
+    toy, first, second = two
+    copied = Path(shutil.copy(second / "report.html", tmp_path / "copy.html"))
+    (first / "report.html").write_bytes(b" " * copied.stat().st_size)
+
+    def refuse(path: Path) -> str:
+        if path == first / "report.html":
+            raise PermissionError(13, "Permission denied", str(path))
+        return digest_from_file(path)
+
+    monkeypatch.setattr("pano_mvs_lineage.why.digest_from_file", refuse)
+    assert why(copied, runs=toy.folder / "runs").out == second
+
+
+def test_a_file_beside_a_damaged_origin_is_found_by_its_content(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """It was said that the run.json of a folder cannot be read which never had one."""
+    toy, first, _ = two
+    name = next(iter(package.load(first).summary.files))
+    (tmp_path / ".pano-mvs-origin").write_text('{"command": 5')
+    copied = shutil.copy(first / name, tmp_path / "copy")
+    assert why(copied, runs=toy.folder / "runs").out == first
 
 
 def test_what_no_run_has_written_is_refused(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
