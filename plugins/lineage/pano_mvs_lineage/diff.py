@@ -8,19 +8,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
-from pano_mvs.geometry import geodesic_angle
-from pano_mvs.geometry.pose_errors import align_centers, camera_extent
 from pano_mvs.session.code_listing import changed_functions, read_code_listing
+from pano_mvs_lineage.alignment import MOVED_SHARE, TURNED_DEG, align_runs, camera_changes
 from pano_mvs_lineage.range_changes import CLASSES, RangeChange, range_changes
 from pano_mvs_lineage.stored_runs import StoredRun
-
-# Cameras that moved less are counted, not listed: a global solve moves every camera a little.
-_MOVED_SHARE, _TURNED_DEG = 0.002, 0.1
 
 
 @dataclass(frozen=True)
@@ -46,7 +40,7 @@ class CameraChange:
 
 @dataclass(frozen=True)
 class PoseChanges:
-    """The cameras of two runs; those of the largest group are aligned by a similarity."""
+    """The cameras of two runs; those of the largest group are aligned by the ones that stayed where they were."""
 
     only_before: tuple[str, ...] = ()
     only_after: tuple[str, ...] = ()
@@ -56,7 +50,7 @@ class PoseChanges:
     @property
     def moved(self) -> tuple[CameraChange, ...]:
         """Those that moved by .2 % of the capture's extent, or turned by .1°, and more."""
-        return tuple(one for one in self.cameras if one.moved >= _MOVED_SHARE or one.turned_deg >= _TURNED_DEG)
+        return tuple(one for one in self.cameras if one.moved >= MOVED_SHARE or one.turned_deg >= TURNED_DEG)
 
 
 @dataclass(frozen=True)
@@ -359,19 +353,14 @@ def _poses(old: StoredRun, new: StoredRun) -> PoseChanges:
     common = [name for name in before if name in after and groups[0][name] == groups[1][name] == 0]
     if len(common) < 2:
         return PoseChanges(*only, note="fewer than two cameras of the largest groups are the same")
+    before, after = ({name: cameras[name] for name in common} for cameras in (before, after))
     try:
-        aligned = align_centers({name: before[name] for name in common}, {name: after[name] for name in common})
+        aligned = align_runs(before, after)
     except UsageError as error:
         return PoseChanges(*only, note=str(error))
-    extent = camera_extent({name: after[name] for name in common}) or 1.0
-    moved = aligned.apply([before[name].center for name in common]) - [after[name].center for name in common]
-    turned = geodesic_angle(
-        np.array([before[name].rotation @ aligned.rotation.T for name in common]),
-        np.array([after[name].rotation for name in common]),
-    )
     found = [
-        CameraChange(name, float(np.linalg.norm(step)) / extent, float(np.rad2deg(angle)))
-        for name, step, angle in zip(common, moved, turned, strict=True)
+        CameraChange(name, float(share), float(turn_deg))
+        for name, share, turn_deg in zip(common, *camera_changes(aligned, before, after), strict=True)
     ]
     return PoseChanges(*only, tuple(sorted(found, key=lambda one: (-one.moved, one.name))))
 
