@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.core.digest import IS_DIGEST
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
@@ -226,7 +227,9 @@ def _reason(
     if before.get("stage") != after.get("stage"):
         return f"stage {before.get('stage')} → {after.get('stage')}"
     params = _changes(before.get("params", {}), after.get("params", {}))
-    parts += [f"setting {change}" for change in params]
+    parts += [
+        f"content of the setting {change.name}" if _are_digests(change) else f"setting {change}" for change in params
+    ]
     if before.get("version") != after.get("version"):
         parts.append(f"version {before.get('version')} → {after.get('version')}")
     if before.get("code") != after.get("code"):
@@ -241,6 +244,14 @@ def _reason(
     if before.get("schema") != after.get("schema"):
         parts.append("keys of another version of the program")
     return ", ".join(parts) or "keys of another version of the program"
+
+
+def _are_digests(change: Change) -> bool:
+    """Return whether a setting names files, which an identity has as a list of the digests of their contents."""
+    both = change.before, change.after
+    return all(
+        isinstance(value, list) and value and all(IS_DIGEST.fullmatch(str(one)) for one in value) for value in both
+    )
 
 
 def digests_in(value: Any) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, diff
+from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, _reason, diff
 from pano_mvs_lineage.page import diff_page
 from pano_mvs_lineage.range_changes import compare_ranges
 from pano_mvs_lineage.runs import runs
@@ -17,7 +17,7 @@ from pano_mvs_lineage.stored_runs import StoredRun
 from pano_mvs_lineage.why import repeat, why
 
 import pano_mvs as package
-from pano_mvs.core.digest import digest_from_file
+from pano_mvs.core.digest import digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.results.origin import Origin, RunName
@@ -142,6 +142,16 @@ def test_the_functions_that_differ_are_named(toy: Toy) -> None:
     assert diff(second, run_into(toy, "third")).is_same
     (second / "logs" / "code.json").write_text("[]")
     assert diff(first, second).reasons["scaled"] == "code of toy.scale"
+
+
+def test_files_that_settings_name_differ_by_their_content() -> None:
+    """It listed digests: setting path: ['4bac70…'] → ['00c85f…']."""
+    before, after = (
+        {"stage": "poses", "params": {"path": [digest_from_bytes(text)], "by": 2}} for text in (b"a", b"b")
+    )
+    assert _reason(before, after, producers={}, functions=()) == "content of the setting path"
+    numbers = ({"params": {"limits": limits}} for limits in ([1], [2]))
+    assert _reason(*numbers, producers={}, functions=()) == "setting limits: [1] → [2]"
 
 
 def test_reasons_are_in_the_order_of_the_workflow(two: tuple[Toy, Path, Path]) -> None:
