@@ -25,6 +25,7 @@ from pano_mvs.engine.workflows.workflow_file import WorkflowFile, WorkflowFilesR
 
 _MOST_VALUES = 8  # of a setting that are tried before a hint at `pano-mvs vary`
 
+
 @dataclass(frozen=True, slots=True)
 class StageEntry:
     """One stage of a workflow, validated."""

@@ -20,7 +20,11 @@ import pano_mvs as package
 from pano_mvs.core.digest import digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.results.origin import Origin, RunName
+from pano_mvs.session.code_listing import read_code_listing, write_code_listing
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
@@ -72,6 +76,15 @@ def test_a_run_that_lacks_a_stage_hides_no_setting(two: tuple[Toy, Path, Path]) 
     table = runs(toy.folder / "runs")  # one folder is no sequence of letters
     assert len(table.rows) == 3
     assert table.settings == ("scaled.by",)
+
+
+def test_runs_without_a_value_come_last_in_either_order(two: tuple[Toy, Path, Path]) -> None:
+    """With the largest first, runs that lack the setting were listed before all others."""
+    toy, first, second = two
+    session = replace(toy.session(), out=toy.folder / "runs" / "part", run_options=RunOptions(until=("images",)))
+    run_session(session, Execution("serial"))
+    for sort, order in (("scaled.by", [first, second]), ("-scaled.by", [second, first])):
+        assert [row.out for row in runs(toy.folder / "runs", sort=sort).rows] == [*order, session.out]
 
 
 def test_links_to_runs_are_followed_and_no_run_is_listed_twice(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
@@ -152,6 +165,40 @@ def test_files_that_settings_name_differ_by_their_content() -> None:
     assert _reason(before, after, producers={}, functions=()) == "content of the setting path"
     numbers = ({"params": {"limits": limits}} for limits in ([1], [2]))
     assert _reason(*numbers, producers={}, functions=()) == "setting limits: [1] → [2]"
+
+
+def test_functions_of_one_name_are_not_confused(toy: Toy) -> None:
+    """Of a getter and its setter only the last one counted."""
+    getter = "    @property\n    def value(self): return 1\n"
+    added = f"\nclass Limit:\n{getter}    @value.setter\n    def value(self, to): pass\n"
+    toy.edit("helper.py", lambda text: text + added)
+    first = run_into(toy, "first")
+    toy.edit("helper.py", lambda text: text.replace("return 1", "return 2"))
+    assert "helper.py: Limit.value" in diff(first, run_into(toy, "second")).reasons["scaled"]
+
+
+def test_files_of_one_name_in_two_folders_are_two(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each stage was listed with the functions of the last file of this name."""
+
+    def functions_of(spec: StageSpec, _: Params) -> dict[str, dict[str, str]]:
+        return {"plug.py": {"run": spec.name}, "shared.py": {"": "1"}}
+
+    monkeypatch.setattr("pano_mvs.session.code_listing.code_functions", functions_of)
+    workflow = toy.session().workflow
+    write_code_listing(tmp_path, workflow)
+    for name in ("scaled", "mean"):
+        entry = workflow.stages[name]
+        digest = stage_code(entry.spec, entry.params).digest
+        listed = read_code_listing(tmp_path, name, digest)
+        assert listed == {"plug.py": {"run": entry.spec.name}, "shared.py": {"": "1"}}
+
+
+def test_a_plugin_that_becomes_unreadable_during_a_run_costs_the_reasons_alone(toy: Toy, tmp_path: Path) -> None:
+    """Bytes that are no text ended the run with an internal error, after its results were written."""
+    workflow = toy.session().workflow
+    (toy.folder / "helper.py").write_bytes(b"\xff\xfe\x00 = 1")
+    write_code_listing(tmp_path, workflow)
+    assert not (tmp_path / "logs" / "code.json").exists()
 
 
 def test_reasons_are_in_the_order_of_the_workflow(two: tuple[Toy, Path, Path]) -> None:
