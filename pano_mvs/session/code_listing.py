@@ -30,7 +30,7 @@ def write_code_listing(out: Path, workflow: Workflow) -> None:
         if _read(out).get("digests") == digests:
             return
         by_stage = {name: code_functions(entry.spec, entry.params) for name, entry in entries}
-        files: list[tuple[str, Mapping[str, str]]] = []  # plugins in two folders may have files of one name
+        files: list[tuple[str, Mapping[str, str]]] = []  # files of plugins in two folders may have the same name
         stages: dict[str, list[int]] = {}
         for name, found in by_stage.items():
             files += [file for file in found.items() if file not in files]

@@ -355,7 +355,7 @@ def _parsed(text: str) -> _Parsed:
 def _function_digests(tree: ast.Module) -> dict[str, str]:
     """Return a short digest of each function and method in a module, and of its other statements under "".
 
-    Functions of one name, such as the getter and the setter of a property, have one digest.
+    Functions with the same name, such as the getter and the setter of a property, have one digest.
     """
     found: dict[str, list[ast.AST]] = {"": []}
     for node in tree.body:
