@@ -60,7 +60,7 @@ def few_and_all_matches(
 ) -> Iterator[NDArray[np.int32]]:
     """Yield the matches of a part of the key points in the most similar views, and then those of `match_learned`.
 
-    The first ones tell most pairs of images that show nothing in common, and many of those that clearly do.
+    The first ones decide most pairs of images that show nothing in common, and many of those that clearly do.
     """
     views = _Views(first, second, max_views, networks)
     yield views.matches(min_score=min_score, views=_FIRST_VIEWS, keypoints=_FIRST_KEYPOINTS)
