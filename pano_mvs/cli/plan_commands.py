@@ -127,7 +127,10 @@ def _expected(forecasts: Sequence[StageForecast], workers: int) -> tuple[str, st
     seconds = sum((one.seconds or 0.0) / max(1, min(workers, one.units or 1)) for one in known)
     at_least = "" if len(known) == len(own) else "at least "
     kept = [one for one in known if not one.is_temporary]
-    size = f"{at_least}{size_text(round(sum(one.kept_bytes or 0.0 for one in kept)))}" if kept else "dropped"
+    if kept:
+        size = f"{at_least}{size_text(round(sum(one.kept_bytes or 0.0 for one in kept)))}"
+    else:  # a stage that is not known may keep its results
+        size = "dropped" if all(one.is_temporary for one in own) else "unknown"
     return f"{at_least}{duration_text(seconds)}", size
 
 

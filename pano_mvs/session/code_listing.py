@@ -15,7 +15,7 @@ from pano_mvs.engine.stages.stage_code import code_functions, stage_code
 from pano_mvs.engine.workflows.workflow import Workflow
 
 CODE_JSON = "code.json"
-_SCHEMA = 1
+_SCHEMA = 2
 
 
 def write_code_listing(out: Path, workflow: Workflow) -> None:
@@ -24,15 +24,17 @@ def write_code_listing(out: Path, workflow: Workflow) -> None:
     They only serve to explain differences: if the folder cannot be written, or a file was changed meanwhile, nothing is
     listed.
     """
-    with suppress(StoreError, OSError, SyntaxError):
+    with suppress(StoreError, OSError, SyntaxError, ValueError):
         entries = workflow.stages.items()
         digests = {name: stage_code(entry.spec, entry.params).digest for name, entry in entries}
         if _read(out).get("digests") == digests:
             return
         by_stage = {name: code_functions(entry.spec, entry.params) for name, entry in entries}
-        files = {file: functions for found in by_stage.values() for file, functions in found.items()}
-        place = {file: idx for idx, file in enumerate(files)}
-        stages = {name: [place[file] for file in found] for name, found in by_stage.items()}
+        files: list[tuple[str, Mapping[str, str]]] = []  # files of plugins in two folders may have the same name
+        stages: dict[str, list[int]] = {}
+        for name, found in by_stage.items():
+            files += [file for file in found.items() if file not in files]
+            stages[name] = [files.index(file) for file in found.items()]
         value = {"schema": _SCHEMA, "digests": digests, "files": files, "stages": stages}
         write_text(out / LOG_FOLDER / CODE_JSON, json.dumps(value))
 
@@ -47,7 +49,7 @@ def read_code_listing(out: Path, stage: str, digest: str) -> Mapping[str, Mappin
     try:
         if found["digests"][stage] != digest:
             return {}
-        files = list(found["files"].items())
+        files = found["files"]
         return {name: dict(functions) for name, functions in (files[idx] for idx in found["stages"][stage])}
     except (KeyError, TypeError, ValueError, AttributeError, IndexError):
         return {}

@@ -47,6 +47,7 @@ class RunStarted:
     threads: int  # of each worker
     out: Path  # the output folder
     cache: Path = Path()  # the folder of the cache
+    groups: Mapping[str, str] = field(default_factory=dict)  # stage to its group of stages, if it is in one
 
 
 @dataclass(frozen=True, slots=True)

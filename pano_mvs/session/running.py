@@ -117,6 +117,7 @@ def _run_and_report(
             threads=executor.threads,
             out=session.out,
             cache=store.root.absolute(),
+            groups={name: stage.group for name, stage in session.workflow.stages.items() if stage.group},
         )
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from typer.testing import CliRunner
 import pano_mvs as package
 from pano_mvs.cli.app import app
 from pano_mvs.cli.check_command import watch_workflow
+from pano_mvs.cli.plan_commands import _expected
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.planning.unit_keys import _static_identity
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.editor_schema import workflow_schema
@@ -114,6 +117,15 @@ def test_stages_that_no_run_computed_are_named(pano_mvs: Command, here: Path) ->
     planned = pano_mvs("plan", here / "wf.yaml", "--set", "scaled.by=5")
     assert "at least" in planned.text
     assert "in the cache, by earlier runs; unknown: pairs, difference, shifted … (5 in all)" in planned.flat
+
+
+def test_a_group_of_which_a_stage_is_unknown_is_not_said_to_be_dropped() -> None:
+    """The disk space of a group was `dropped` although a stage of it that no run has computed keeps its results."""
+    temporary = StageForecast("first", (), 0, units=2, unit_s=3.0, unit_bytes=1e6, is_temporary=True)
+    assert _expected([temporary], 1) == ("6 s", "dropped")
+    assert _expected([temporary, StageForecast("second", (), 0, units=2)], 1) == ("at least 6 s", "unknown")
+    kept = replace(temporary, is_temporary=False)
+    assert _expected([temporary, kept], 1) == ("12 s", "2.0 MB")
 
 
 def test_a_dry_run_is_the_plan_and_writes_nothing(pano_mvs: Command, here: Path) -> None:

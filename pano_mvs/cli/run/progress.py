@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import TracebackType
 from typing import TextIO, cast
@@ -45,6 +45,7 @@ class ProgressDisplay:
         """Forget an earlier run."""
         self._estimator, self._countdown, self._began = TimeEstimator(self._clock), Countdown(), self._clock()
         self._kernels, self._kernels_at = 0, -math.inf
+        self._groups: Mapping[str, str] = {}  # stage to its group
 
     def __enter__(self) -> ProgressDisplay:
         """Start to draw, on a stream that stays when the output of units is captured (executor `serial`)."""
@@ -85,6 +86,8 @@ class ProgressDisplay:
         if not isinstance(event, Warned):
             self._beginning = "listing the images and looking for copies" if isinstance(event, RunStarted) else ""
         match event:
+            case RunStarted(groups=groups):
+                self._groups = groups
             case Forecast():
                 self._countdown = Countdown()  # begin with the forecast rather than glide to it
             case KernelsCompiled(kernels=kernels):
@@ -115,8 +118,10 @@ class ProgressDisplay:
             table = Table.grid(padding=(0, 2))
             for name, stage in stages[:_SHOWN_STAGES]:
                 bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=_BAR_WIDTH)
+                group = [Text(one_line(self._groups.get(name, "")))] if self._groups else []
                 table.add_row(
                     Text(one_line(name).ljust(_NAME_WIDTH)),
+                    *group,
                     bar,
                     _count(stage),
                     clock_text(stage.own_s(now)),
@@ -142,7 +147,7 @@ class ProgressDisplay:
         with self._lock:
             left = self._estimator.estimate()
             text = self._left_text(left, duration_text(left.seconds_left), left.seconds_left)
-            stages = [f"{one_line(name)} {_count(stage)}" for name, stage in self._running()]
+            stages = [f"{self._place(name)} {_count(stage)}" for name, stage in self._running()]
             stages += filter(None, [self._compiling()])
             now = f" (now: {shortened_list(stages)})" if stages else ""
             line = "; ".join([f"{100 * left.done:.0f} %, {text}{now}", *self._further()])
@@ -160,6 +165,11 @@ class ProgressDisplay:
 
     def _running(self) -> list[tuple[str, StageProgress]]:
         return [(name, stage) for name, stage in self._estimator.stages.items() if stage.running]
+
+    def _place(self, stage: str) -> str:
+        """Return the name of a stage after that of its group, which plans and the report list."""
+        group = self._groups.get(stage, "")
+        return one_line(f"{group}: {stage}" if group else stage)
 
     def _compiling(self) -> str:
         """Return how many kernels have been compiled, while they are; else nothing."""

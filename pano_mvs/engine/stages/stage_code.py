@@ -353,21 +353,24 @@ def _parsed(text: str) -> _Parsed:
 
 
 def _function_digests(tree: ast.Module) -> dict[str, str]:
-    """Return a short digest of each function and method in a module, and of its other statements under ""."""
-    found: dict[str, str] = {}
-    rest: list[ast.stmt] = []
+    """Return a short digest of each function and method in a module, and of its other statements under "".
+
+    Functions with the same name, such as the getter and the setter of a property, have one digest.
+    """
+    found: dict[str, list[ast.AST]] = {"": []}
     for node in tree.body:
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
-                found[name] = _short_digest([node])
+                found.setdefault(name, []).append(node)
             case ast.ClassDef(name=name, body=body):
                 methods = [one for one in body if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)]
-                found |= {f"{name}.{one.name}": _short_digest([one]) for one in methods}
+                for method in methods:
+                    found.setdefault(f"{name}.{method.name}", []).append(method)
                 others = [one for one in body if one not in methods]
-                found[name] = _short_digest([*node.decorator_list, *node.bases, *node.keywords, *others])
+                found.setdefault(name, []).extend([*node.decorator_list, *node.bases, *node.keywords, *others])
             case _:
-                rest.append(node)
-    return found | {"": _short_digest(rest)}
+                found[""].append(node)
+    return {name: _short_digest(nodes) for name, nodes in found.items()}
 
 
 def _short_digest(nodes: Sequence[ast.AST]) -> str:

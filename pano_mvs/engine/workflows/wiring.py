@@ -186,7 +186,7 @@ class _Wirer:
             for name, removed in self.workflow.removed.items()
             if name not in self.stages and removed.spec is not None and _delivered_by(removed.spec, port) is not None
         }
-        if gone and not later:
+        if gone:  # a stage below may read what is missing, so that it cannot feed it
             hint = f" ({'; '.join(f'stage {name!r} {how}' for name, how in gone.items())}): {_remedy(entry, port)}"
         need = "needs an index" if port.name == INDEX_PORT else "needs"
         return f"stage {entry.name!r} {need} {port}, but no earlier stage produces {port.kind.kind_name()}{hint}"

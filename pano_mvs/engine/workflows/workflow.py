@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +22,8 @@ from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.workflows.merged_stages import MergedStages, Removed, StageGroup
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.workflows.workflow_file import WorkflowFile, WorkflowFilesReader, read_text
+
+_MOST_VALUES = 8  # of a setting that are tried before a hint at `pano-mvs vary`
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +145,7 @@ class WorkflowReader:
             name: entry for name, node in entries.items() if (entry := self._stage(name, node, groups)) is not None
         }
         if self.problems.lines:
-            self._hint_at_vary(overrides)
+            self._hint_at_vary(text, overrides, path)
             unknown = frozenset({*merged.written, *entries} - set(stages))
             raise InvalidWorkflowError(self.problems.lines, stages, unknown)
         root = files[-1].root
@@ -213,15 +216,29 @@ class WorkflowReader:
         self.folders |= {one.shown_as: one.base for one in merged.group_files}
         return rest
 
-    def _hint_at_vary(self, overrides: Sequence[str]) -> None:
-        """Add to the errors about several values of a setting which command takes these."""
-        for text in overrides:
-            target, _, written = text.partition("=")
-            if "," not in written or written.strip().startswith(("[", "{", '"', "'")):
-                continue
-            hint = f". `pano-mvs vary --set {target.strip()}={written.strip()}` runs with each of these values"
+    def _hint_at_vary(self, text: str, overrides: Sequence[str], path: Path | None) -> None:
+        """Add to the errors about several values of a setting which command takes these, if each is a valid one."""
+        for override in overrides:
+            target, _, written = (part.strip() for part in override.partition("="))
+            refused, values = f"--set {target}:", [value.strip() for value in written.split(",")]
             lines = self.problems.lines
-            lines[:] = [f"{line}{hint}" if line.startswith(f"--set {target.strip()}:") else line for line in lines]
+            if len(values) < 2 or not any(line.startswith(refused) for line in lines):
+                continue
+            others = [one for one in overrides if one.partition("=")[0].strip() != target and "," not in one]
+            single = ([*others, f"{target}={value}"] for value in values[:_MOST_VALUES])
+            if any(line.startswith(refused) for given in single for line in self._problems_with(text, given, path)):
+                continue
+            hint = f". `pano-mvs vary --set {shlex.quote(f'{target}={written}')}` runs with each of these values"
+            lines[:] = [f"{line}{hint}" if line.startswith(refused) else line for line in lines]
+
+    def _problems_with(self, text: str, overrides: Sequence[str], path: Path | None) -> list[str]:
+        """Return the errors of the workflow with other settings."""
+        reader = WorkflowReader(self.shown_as, self.base, self.registry, presets=self.presets)
+        try:
+            reader.read(text, overrides=overrides, path=path)
+        except WorkflowError as error:
+            return error.problems
+        return []
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:

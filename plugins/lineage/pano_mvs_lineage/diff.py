@@ -8,19 +8,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from pano_mvs.core.digest import IS_DIGEST
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import exists
 from pano_mvs.core.text import finite_or_none, plural, shortened_list
-from pano_mvs.geometry import geodesic_angle
-from pano_mvs.geometry.pose_errors import align_centers, camera_extent
 from pano_mvs.session.code_listing import changed_functions, read_code_listing
+from pano_mvs_lineage.alignment import MOVED_SHARE, TURNED_DEG, align_runs, camera_changes
 from pano_mvs_lineage.range_changes import CLASSES, RangeChange, range_changes
 from pano_mvs_lineage.stored_runs import StoredRun
-
-# Cameras that moved less are counted, not listed: a global solve moves every camera a little.
-_MOVED_SHARE, _TURNED_DEG = 0.002, 0.1
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class CameraChange:
 
 @dataclass(frozen=True)
 class PoseChanges:
-    """The cameras of two runs; those of the largest group are aligned by a similarity."""
+    """The cameras of two runs; those of the largest group are aligned by the ones that stayed where they were."""
 
     only_before: tuple[str, ...] = ()
     only_after: tuple[str, ...] = ()
@@ -56,7 +51,7 @@ class PoseChanges:
     @property
     def moved(self) -> tuple[CameraChange, ...]:
         """Those that moved by .2 % of the capture's extent, or turned by .1°, and more."""
-        return tuple(one for one in self.cameras if one.moved >= _MOVED_SHARE or one.turned_deg >= _TURNED_DEG)
+        return tuple(one for one in self.cameras if one.moved >= MOVED_SHARE or one.turned_deg >= TURNED_DEG)
 
 
 @dataclass(frozen=True)
@@ -232,7 +227,9 @@ def _reason(
     if before.get("stage") != after.get("stage"):
         return f"stage {before.get('stage')} → {after.get('stage')}"
     params = _changes(before.get("params", {}), after.get("params", {}))
-    parts += [f"setting {change}" for change in params]
+    parts += [
+        f"content of the setting {change.name}" if _are_digests(change) else f"setting {change}" for change in params
+    ]
     if before.get("version") != after.get("version"):
         parts.append(f"version {before.get('version')} → {after.get('version')}")
     if before.get("code") != after.get("code"):
@@ -247,6 +244,14 @@ def _reason(
     if before.get("schema") != after.get("schema"):
         parts.append("keys of another version of the program")
     return ", ".join(parts) or "keys of another version of the program"
+
+
+def _are_digests(change: Change) -> bool:
+    """Return whether a setting names files, which an identity has as a list of the digests of their contents."""
+    both = change.before, change.after
+    return all(
+        isinstance(value, list) and value and all(IS_DIGEST.fullmatch(str(one)) for one in value) for value in both
+    )
 
 
 def digests_in(value: Any) -> list[str]:
@@ -293,11 +298,12 @@ def _named(old: StoredRun, new: StoredRun) -> tuple[dict[str, str], dict[str, st
     if all(len({Path(path).name for path in inputs}) == len(inputs) for inputs in both):
         before, after = ({Path(path).name: digest for path, digest in inputs.items()} for inputs in both)
     else:
-        before, after = (_below_common_folder(inputs) for inputs in both)
+        before, after = (below_common_folder(inputs) for inputs in both)
     return before, after
 
 
-def _below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
+def below_common_folder(inputs: Mapping[str, str]) -> dict[str, str]:
+    """Return the paths of files below the folder that all share, each with its digest."""
     folders = [Path(path).parent for path in inputs]
     above = [one for first in folders[:1] for one in (first, *first.parents)]
     shared = next((one for one in above if all(folder.is_relative_to(one) for folder in folders)), Path())
@@ -358,19 +364,14 @@ def _poses(old: StoredRun, new: StoredRun) -> PoseChanges:
     common = [name for name in before if name in after and groups[0][name] == groups[1][name] == 0]
     if len(common) < 2:
         return PoseChanges(*only, note="fewer than two cameras of the largest groups are the same")
+    before, after = ({name: cameras[name] for name in common} for cameras in (before, after))
     try:
-        aligned = align_centers({name: before[name] for name in common}, {name: after[name] for name in common})
+        aligned = align_runs(before, after)
     except UsageError as error:
         return PoseChanges(*only, note=str(error))
-    extent = camera_extent({name: after[name] for name in common}) or 1.0
-    moved = aligned.apply([before[name].center for name in common]) - [after[name].center for name in common]
-    turned = geodesic_angle(
-        np.array([before[name].rotation @ aligned.rotation.T for name in common]),
-        np.array([after[name].rotation for name in common]),
-    )
     found = [
-        CameraChange(name, float(np.linalg.norm(step)) / extent, float(np.rad2deg(angle)))
-        for name, step, angle in zip(common, moved, turned, strict=True)
+        CameraChange(name, float(share), float(turn_deg))
+        for name, share, turn_deg in zip(common, *camera_changes(aligned, before, after), strict=True)
     ]
     return PoseChanges(*only, tuple(sorted(found, key=lambda one: (-one.moved, one.name))))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.io.images.preview import color_mapped, range_limits
 from pano_mvs.results.pictures import evenly_spaced, picture
 from pano_mvs_lineage.diff import RunDiff
-from pano_mvs_lineage.range_changes import LIMIT, relative_difference, scale_of_view
+from pano_mvs_lineage.range_changes import LIMIT, relative_difference, scales_of_views
 from pano_mvs_lineage.stored_runs import StoredRun
 
 _WIDTH, _MOST_BYTES, _MOST_VIEWS = 960, 120_000, 40
@@ -42,7 +42,9 @@ def diff_page(found: RunDiff, *, cache: str | Path | None = None) -> str:
     if not names:
         names = evenly_spaced([name for name in old.output.views if name in new.output.views], 6)
     summaries = {one.name: str(one).partition(": ")[2] for one in changed}
-    views = [pair for name in names if (pair := _pair(name, old, new, summaries.get(name, "the same ranges")))]
+    scales = scales_of_views(names, old, new)
+    same = "the same ranges"
+    views = [pair for name in names if (pair := _pair(name, old, new, scales[name], summaries.get(name, same)))]
     environment = Environment(
         loader=PackageLoader("pano_mvs_lineage", "templates"),
         autoescape=True,
@@ -54,11 +56,11 @@ def diff_page(found: RunDiff, *, cache: str | Path | None = None) -> str:
     return environment.get_template("diff.html.j2").render(found=found, views=views, left_out=left_out)
 
 
-def _pair(name: str, old: StoredRun, new: StoredRun, summary: str) -> ViewPair | None:
+def _pair(name: str, old: StoredRun, new: StoredRun, scale: float, summary: str) -> ViewPair | None:
     before, after = old.output.views[name].range_map, new.output.views[name].range_map
     if before is None or after is None:
         return None
-    before = (scale_of_view(name, old, new) * before).astype(np.float32)
+    before = (scale * before).astype(np.float32)
     if after.shape != before.shape:
         after = cv2.resize(after, before.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float32)
     limits = range_limits(after)

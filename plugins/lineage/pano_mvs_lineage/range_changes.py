@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
-from pano_mvs.geometry.pose_errors import align_centers
+from pano_mvs.scene import Poses
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs_lineage.alignment import align_runs
 from pano_mvs_lineage.stored_runs import StoredRun
 
 LIMIT = 0.01  # a range that differs by more than this share counts as changed
@@ -46,7 +47,8 @@ def range_changes(old: StoredRun, new: StoredRun) -> tuple[RangeChange, ...]:
     Ranges of runs in other units of length are compared after scaling by the distances of the cameras.
     """
     found = []
-    for name, scale in _common(old, new):
+    common = [name for name in old.output.views if name in new.output.views]
+    for name, scale in scales_of_views(common, old, new).items():
         before, after = (run.output.views[name] for run in (old, new))
         one, other, confidence = before.range_map, after.range_map, after.confidence
         if one is None or other is None:
@@ -111,30 +113,27 @@ def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_], weight: FloatArray
     return float(weight[part].sum()) / total if total else 0.0
 
 
-def _common(old: StoredRun, new: StoredRun) -> Iterator[tuple[str, float]]:
-    """Yield the views that both runs have, with the factor from the first run's unit of length to the other's."""
-    for name in old.output.views:
-        if name in new.output.views:
-            yield name, scale_of_view(name, old, new)
-
-
-def scale_of_view(name: str, old: StoredRun, new: StoredRun) -> float:
-    """Return the factor from the unit of length of a view in one run to that in the other; 1 if it is not known.
+def scales_of_views(names: Iterable[str], old: StoredRun, new: StoredRun) -> dict[str, float]:
+    """Return the factor from the unit of length of each view in one run to that in the other; 1 if it is not known.
 
     Each group of cameras has a unit of its own: those of the view's groups that both runs have are compared.
     """
     one, other = old.output.poses, new.output.poses
-    if one is None or other is None or name not in one.names or name not in other.names:
-        return 1.0
+    if one is None or other is None:
+        return dict.fromkeys(names, 1.0)
     groups = [dict(zip(poses.names, poses.groups.tolist(), strict=True)) for poses in (one, other)]
-    common = [
-        image
-        for image in one.names
-        if groups[0][image] == groups[0][name] and groups[1].get(image, -1) == groups[1][name]
-    ]
-    both = [{image: poses.cameras[image] for image in common} for poses in (one, other)]
+    members: dict[tuple[int, int], list[str]] = {}
+    for image in one.names:
+        if image in groups[1]:
+            members.setdefault((groups[0][image], groups[1][image]), []).append(image)
+    scales = {image: scale for common in members.values() for image, scale in _scales(common, one, other)}
+    return {name: scales.get(name, 1.0) for name in names}
+
+
+def _scales(images: Sequence[str], one: Poses, other: Poses) -> Iterator[tuple[str, float]]:
+    """Yield images of one group with the factor between their units of length."""
     try:
-        scale = align_centers(*both).scale
+        scale = align_runs(*({image: poses.cameras[image] for image in images} for poses in (one, other))).scale
     except UsageError:  # too few cameras, or all in one place
-        return 1.0
-    return 1.0 if abs(scale - 1) < 1e-9 else scale
+        scale = 1.0
+    yield from ((image, 1.0 if abs(scale - 1) < 1e-9 else scale) for image in images)

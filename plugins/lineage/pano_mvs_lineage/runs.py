@@ -96,7 +96,8 @@ def runs(
     Args:
         folders: output folders, or folders of these at any depth.
         metrics: `STAGE.METRIC` of those to list; by default the scores against ground truth of runs that have them.
-        sort: the column by which rows are sorted, with `-` before it for the largest first; by default the start.
+        sort: the column by which rows are sorted, with `-` before it for the largest first; by default the start. Runs
+            without a value come last.
 
     Raises:
         InputError: if there is no run in a folder.
@@ -196,7 +197,8 @@ def _sorted(table: RunTable, sort: str) -> RunTable:
         try:
             return (0, float(text), "")
         except ValueError:
-            return (1, 0.0, text) if text else (2, 0.0, "")
+            return (1, 0.0, text)
 
     rows = sorted(table.rows, key=place, reverse=sort.startswith("-"))
+    rows.sort(key=lambda row: not table.cells(row)[column])  # those without a value come last, in either order
     return replace(table, rows=tuple(rows))

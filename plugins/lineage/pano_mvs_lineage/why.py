@@ -25,10 +25,11 @@ from pano_mvs.results.summary import RUN_JSON
 from pano_mvs.scene.files import item_stems
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions, reopen
-from pano_mvs_lineage.diff import digests_in
+from pano_mvs_lineage.diff import below_common_folder, digests_in
 from pano_mvs_lineage.stored_runs import StoredRun, as_paths, find_runs
 
 REPORT = "report.html"
+_MOST_IMAGES = 12  # names on the terminal: a tour of tiles has thousands
 _COMMANDS = {"ro-crate-metadata.json": "crate"}  # what a command writes into the folder of a run
 
 
@@ -100,7 +101,7 @@ class FileOrigin:
             which = f"{units[0].label} ({units[0].what})" if len(units) == 1 else f"{stage} ({units[0].what})"
             key = units[0].key[:12] if len(units) == 1 else f"{len(units)} units"
             lines.append(f"  {which}, {seconds:.2f} s, {key}")
-        images = ", ".join(Path(path).name for path in self.images)
+        images = shortened_list(list(below_common_folder(self.images)), _MOST_IMAGES)
         lines.append(f"images: {images or 'run.json does not list them'}")
         return [*lines, *self.notes]
 
@@ -131,6 +132,8 @@ def why(
     root = None if cache is None else Path(cache)
     place = _folder_above(path)
     made_by = Origin.read(place) if place is not None and not is_file(place / RUN_JSON) else None
+    if made_by is None and place is not None and not is_file(place / RUN_JSON):
+        place = None  # what the command has left there cannot be read
     searched = as_paths(runs) if runs else []
     if place is not None and made_by is not None:
         return _derived(
@@ -205,10 +208,11 @@ def _beside(path: Path, name: str, run: StoredRun) -> FileOrigin | None:
 
 
 def _is_copy(path: Path, digest: str, other: Path) -> bool:
-    """Return whether another file has the same content."""
-    if not is_file(other) or other.stat().st_size != path.stat().st_size:
+    """Return whether another file can be read and has the same content."""
+    try:
+        return is_file(other) and other.stat().st_size == path.stat().st_size and digest_from_file(other) == digest
+    except OSError:  # it may not be read, or is gone by now
         return False
-    return digest_from_file(other) == digest
 
 
 def _folders_of_commands(folders: Iterable[Path]) -> Iterator[Path]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, diff
+from pano_mvs_lineage.diff import Change, PoseChanges, RunDiff, _images, _reason, diff
 from pano_mvs_lineage.page import diff_page
 from pano_mvs_lineage.range_changes import compare_ranges
 from pano_mvs_lineage.runs import runs
@@ -17,9 +17,14 @@ from pano_mvs_lineage.stored_runs import StoredRun
 from pano_mvs_lineage.why import repeat, why
 
 import pano_mvs as package
+from pano_mvs.core.digest import digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.results.origin import Origin, RunName
+from pano_mvs.session.code_listing import read_code_listing, write_code_listing
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
@@ -71,6 +76,15 @@ def test_a_run_that_lacks_a_stage_hides_no_setting(two: tuple[Toy, Path, Path]) 
     table = runs(toy.folder / "runs")  # one folder is no sequence of letters
     assert len(table.rows) == 3
     assert table.settings == ("scaled.by",)
+
+
+def test_runs_without_a_value_come_last_in_either_order(two: tuple[Toy, Path, Path]) -> None:
+    """With the largest first, runs that lack the setting were listed before all others."""
+    toy, first, second = two
+    session = replace(toy.session(), out=toy.folder / "runs" / "part", run_options=RunOptions(until=("images",)))
+    run_session(session, Execution("serial"))
+    for sort, order in (("scaled.by", [first, second]), ("-scaled.by", [second, first])):
+        assert [row.out for row in runs(toy.folder / "runs", sort=sort).rows] == [*order, session.out]
 
 
 def test_links_to_runs_are_followed_and_no_run_is_listed_twice(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
@@ -141,6 +155,50 @@ def test_the_functions_that_differ_are_named(toy: Toy) -> None:
     assert diff(second, run_into(toy, "third")).is_same
     (second / "logs" / "code.json").write_text("[]")
     assert diff(first, second).reasons["scaled"] == "code of toy.scale"
+
+
+def test_files_that_settings_name_differ_by_their_content() -> None:
+    """It listed digests: setting path: ['4bac70…'] → ['00c85f…']."""
+    before, after = (
+        {"stage": "poses", "params": {"path": [digest_from_bytes(text)], "by": 2}} for text in (b"a", b"b")
+    )
+    assert _reason(before, after, producers={}, functions=()) == "content of the setting path"
+    numbers = ({"params": {"limits": limits}} for limits in ([1], [2]))
+    assert _reason(*numbers, producers={}, functions=()) == "setting limits: [1] → [2]"
+
+
+def test_functions_of_one_name_are_not_confused(toy: Toy) -> None:
+    """Of a getter and its setter only the last one counted."""
+    getter = "    @property\n    def value(self): return 1\n"
+    added = f"\nclass Limit:\n{getter}    @value.setter\n    def value(self, to): pass\n"
+    toy.edit("helper.py", lambda text: text + added)
+    first = run_into(toy, "first")
+    toy.edit("helper.py", lambda text: text.replace("return 1", "return 2"))
+    assert "helper.py: Limit.value" in diff(first, run_into(toy, "second")).reasons["scaled"]
+
+
+def test_files_of_one_name_in_two_folders_are_two(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each stage was listed with the functions of the last file of this name."""
+
+    def functions_of(spec: StageSpec, _: Params) -> dict[str, dict[str, str]]:
+        return {"plug.py": {"run": spec.name}, "shared.py": {"": "1"}}
+
+    monkeypatch.setattr("pano_mvs.session.code_listing.code_functions", functions_of)
+    workflow = toy.session().workflow
+    write_code_listing(tmp_path, workflow)
+    for name in ("scaled", "mean"):
+        entry = workflow.stages[name]
+        digest = stage_code(entry.spec, entry.params).digest
+        listed = read_code_listing(tmp_path, name, digest)
+        assert listed == {"plug.py": {"run": entry.spec.name}, "shared.py": {"": "1"}}
+
+
+def test_a_plugin_that_becomes_unreadable_during_a_run_costs_the_reasons_alone(toy: Toy, tmp_path: Path) -> None:
+    """Bytes that are no text ended the run with an internal error, after its results were written."""
+    workflow = toy.session().workflow
+    (toy.folder / "helper.py").write_bytes(b"\xff\xfe\x00 = 1")
+    write_code_listing(tmp_path, workflow)
+    assert not (tmp_path / "logs" / "code.json").exists()
 
 
 def test_reasons_are_in_the_order_of_the_workflow(two: tuple[Toy, Path, Path]) -> None:
@@ -377,6 +435,42 @@ def test_units_of_one_stage_take_one_line(two: tuple[Toy, Path, Path]) -> None:
     assert len(several) > 1
     assert len(lines) == 1
     assert lines[0].endswith(f"{len(several)} units")
+
+
+def test_many_images_are_named_below_their_folder_and_shortened(two: tuple[Toy, Path, Path]) -> None:
+    """The tiles of a tour were named without their folders, all of them: "0.png, 1.png, 0.png, …"."""
+    _, first, _ = two
+    origin = why(first / next(iter(package.load(first).summary.files)))
+    tiles = {f"/site/tiles/{scene}/{row}.png": "" for scene in ("hall", "kitchen") for row in range(9)}
+    (line,) = (line for line in replace(origin, images=tiles).lines() if line.startswith("images: "))
+    assert line.startswith("images: hall/0.png, hall/1.png, ")
+    assert line.endswith(" … (18 in all)")
+
+
+def test_a_search_passes_files_that_cannot_be_read(
+    two: tuple[Toy, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One file without permission, of the same size, ended the search in all folders."""
+    toy, first, second = two
+    copied = Path(shutil.copy(second / "report.html", tmp_path / "copy.html"))
+    (first / "report.html").write_bytes(b" " * copied.stat().st_size)
+
+    def refuse(path: Path) -> str:
+        if path == first / "report.html":
+            raise PermissionError(13, "Permission denied", str(path))
+        return digest_from_file(path)
+
+    monkeypatch.setattr("pano_mvs_lineage.why.digest_from_file", refuse)
+    assert why(copied, runs=toy.folder / "runs").out == second
+
+
+def test_a_file_beside_a_damaged_origin_is_found_by_its_content(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:
+    """It was said that the run.json of a folder cannot be read which never had one."""
+    toy, first, _ = two
+    name = next(iter(package.load(first).summary.files))
+    (tmp_path / ".pano-mvs-origin").write_text('{"command": 5')
+    copied = shutil.copy(first / name, tmp_path / "copy")
+    assert why(copied, runs=toy.folder / "runs").out == first
 
 
 def test_what_no_run_has_written_is_refused(two: tuple[Toy, Path, Path], tmp_path: Path) -> None:

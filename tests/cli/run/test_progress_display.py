@@ -44,6 +44,8 @@ from pano_mvs.session.progress import (
     RunStarted,
     TimeLeft,
     WorkersChanged,
+    event_from_line,
+    line_from_event,
 )
 from tests.cli.conftest import Command
 from tests.engine.conftest import Toy, start, wait_for_records
@@ -94,6 +96,21 @@ def test_the_live_lines_show_what_is_computed_and_count_down() -> None:
     assert depth.split() == ["depth", "0", "of", "4", "0:01", "a.jpg"]
     assert whole.endswith("1 %  0:01  about 3:02 left")
     assert [shown.live(1.0)[-1].split()[-2] for _ in range(5)] == ["3:01", "3:00", "2:59", "2:58", "2:57"]
+
+
+def test_stages_are_shown_with_their_group_as_in_plans_and_reports() -> None:
+    """A plan listed `sweep`, and the run only `depth`."""
+    shown = Shown(is_terminal=True)
+    grouped = replace(STARTED, groups={"depth": "sweep"})
+    units = [UnitStarted("depth", "a.jpg"), UnitStarted("cloud", "")]
+    shown.events(grouped, FORECAST, StageStarted("depth", 4), StageStarted("cloud", 1), *units)
+    rows = [line.split() for line in shown.live(1.0)]
+    assert rows[0] == ["depth", "sweep", "0", "of", "4", "0:01", "a.jpg"]
+    assert rows[1] == ["cloud", "0", "of", "1", "0:01"]
+    assert shown.line().endswith("(now: sweep: depth 0 of 4, cloud 0 of 1)")
+    assert (event_from_line(line_from_event(grouped)) or ())[1:] == (grouped,)
+    shown.events(STARTED, UnitStarted("depth", "a.jpg"))
+    assert "sweep" not in "".join(shown.live())
 
 
 def test_the_time_left_is_never_missing_and_never_stands_still() -> None:

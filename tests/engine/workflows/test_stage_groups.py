@@ -322,6 +322,12 @@ def test_mistakes_in_options_about_groups(grouped: Toy, override: str, what: str
             "stage 'difference' needs an index index: One[Pairs], but no earlier stage produces Pairs (stage 'pairs' "
             "was removed (--set pairs)): name another stage by `difference: {in: {index: STAGE}}`",
         ),
+        (
+            "{images: null}",
+            (),
+            "stage 'scaled' needs x: Each[Number], but no earlier stage produces Number (stage 'images' was removed "
+            "(child.yaml:4:10)): name another stage by `scaled: {in: {x: STAGE}}`",
+        ),
     ],
 )
 def test_an_input_that_was_removed_is_named_with_the_place(

@@ -520,6 +520,21 @@ def test_what_cannot_be_set_is_told_with_the_option(settings: Path, override: st
     assert all(line.startswith("--set ") for line in found)
 
 
+@pytest.mark.parametrize(
+    "override", ["many.limits=1,2", "many.limit=1,x", "many.numbers=1,2", "many.limit=[1,2]", "many.limit=1e400,2"]
+)
+def test_vary_is_not_named_where_it_would_refuse_a_value(settings: Path, override: str) -> None:
+    """A misspelt setting, and values that are wrong by themselves, were said to run with it."""
+    found = problems_with(settings, override)
+    assert found
+    assert not any("vary" in line for line in found), found
+
+
+def test_the_command_that_takes_several_values_can_be_copied(settings: Path) -> None:
+    (found,) = problems_with(settings, "many.limit=1, 2")
+    assert "`pano-mvs vary --set 'many.limit=1, 2'` runs" in found
+
+
 REFERENCE = Path(__file__).parents[3] / "docs" / "workflows.md"
 
 
