@@ -161,6 +161,7 @@ _NO_NAMES = {
     *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map"),
     *("io.images.metadata.read_container", "io.transforms_json.open_mask", "io.meshes.read_glb"),
     *("io.poses.json_files.read_json_value", "session.merging.block_runs.open_blocks", "session.session.open_session"),
+    "session.code_listing.read_code_listing",  # names of functions, which are only shown
 }
 
 

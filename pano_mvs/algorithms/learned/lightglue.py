@@ -52,7 +52,7 @@ def match_learned(
     Raises:
         UsageError: if both images have key points but no learned ones, or a network file or the provider is missing.
     """
-    return _Views(first, second, max_views, networks).matches(min_score=min_score)
+    return _Views(first, second, most=max_views, networks=networks).matches(min_score=min_score)
 
 
 def few_and_all_matches(
@@ -62,7 +62,7 @@ def few_and_all_matches(
 
     The first ones suffice for most pairs of images that show nothing in common, and for many that clearly do.
     """
-    views = _Views(first, second, max_views, networks)
+    views = _Views(first, second, most=max_views, networks=networks)
     yield views.matches(min_score=min_score, views=_FIRST_VIEWS, keypoints=_FIRST_KEYPOINTS)
     yield views.matches(min_score=min_score)
 
@@ -70,7 +70,7 @@ def few_and_all_matches(
 class _Views:
     """The most similar views of two panoramas."""
 
-    def __init__(self, first: Features, second: Features, most: int, networks: Networks) -> None:
+    def __init__(self, first: Features, second: Features, *, most: int, networks: Networks) -> None:
         """Find `most` pairs of views; none if an image has no learned key points."""
         if len(first) and len(second) and not (first.learned or second.learned):
             raise UsageError("matches.lightglue needs the key points of features.aliked: add that stage before it")
