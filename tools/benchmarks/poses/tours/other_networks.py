@@ -68,7 +68,10 @@ def found_by(detect: Callable[[Any], tuple[Any, Any, Any]], image: NDArray[np.ui
 def by_glue(glue: Any, first: Found, second: Found) -> NDArray[np.int64]:
     """Return the matches (M, 2) by LightGlue in PyTorch, of the views that are most alike."""
     torch = importlib.import_module("torch")
-    sides = [lightglue.Side(one.descriptors, one.places, 1) for one in (first, second)]
+    sides = [
+        lightglue.Side(one.descriptors, np.ones(len(one.descriptors), np.float32), one.places, 1)
+        for one in (first, second)
+    ]
     pairs: set[tuple[int, int]] = set()
     for views in lightglue._alike(sides[0], sides[1], VIEWS):
         seen = [np.flatnonzero(~np.isnan(side.places[view, :, 0])) for side, view in zip(sides, views, strict=True)]
