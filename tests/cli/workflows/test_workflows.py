@@ -50,6 +50,7 @@ def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, st
         "cloud.ply",
         "report.html",
         "run.json",
+        "logs/code.json",
         "logs/events.jsonl",
         ".pano-mvs-output",
     }
