@@ -97,6 +97,7 @@ def test_a_pair_is_settled_if_it_is_clear_or_shows_no_sign_of_a_geometry() -> No
     assert is_settled(failed)
     assert is_settled(replace(failed, log10_false_alarms=-4.0))
     assert not is_settled(replace(failed, log10_false_alarms=-12.0))
+    assert not is_settled(replace(failed, geometry="rotation")), "other views may show a parallax"
     verified = next(iter(tiny_capture().each(TwoView).values()))
     assert is_settled(replace(verified, log10_false_alarms=-120.0))
     assert not is_settled(replace(verified, log10_false_alarms=-80.0))

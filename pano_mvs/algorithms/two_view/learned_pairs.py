@@ -58,7 +58,12 @@ WEAKEST, PRIOR_ODDS = -3.0, -0.3
 
 
 def is_settled(view: TwoView) -> bool:
-    """Return whether further matches hardly change a pair: its geometry is clear, or there is no sign of one."""
+    """Return whether further matches hardly change a pair: its geometry is clear, or there is no sign of one.
+
+    Views that are most alike may show what is far away, so that two places seem to be one: this is left open.
+    """
+    if view.geometry == "rotation":
+        return False
     return view.log10_false_alarms <= _SETTLED if view else view.log10_false_alarms > _HOPELESS
 
 
