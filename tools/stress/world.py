@@ -119,8 +119,11 @@ def small_disk(folder: Path) -> Iterator[Disk]:
 
 
 def _mount(folder: Path, options: str) -> bool:
-    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
-    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+    return _does_mount("-t", "tmpfs", "-o", options, "tmpfs", str(folder))
+
+
+def _does_mount(*arguments: str) -> bool:
+    return subprocess.run(["mount", *arguments], capture_output=True, check=False).returncode == 0
 
 
 def _count(folder: Path) -> int:
@@ -190,10 +193,16 @@ def unsteady(folder: Path, flag: Path) -> Iterator[Path]:
 @contextmanager
 def read_only(folder: Path) -> Iterator[None]:
     """Let a folder be read-only while the context lasts."""
-    for options in (["--bind", str(folder)], ["-o", "remount,ro,bind"]):
-        if subprocess.run(["mount", *options, str(folder)], check=False, capture_output=True).returncode:
-            raise ImpossibleHereError("needs the right to mount")
+    if not _does_mount("--bind", str(folder), str(folder)):
+        raise ImpossibleHereError("needs the right to mount")
     try:
+        # Refused while a file is open for writing that was opened since the line above.
+        for _ in range(200):
+            if _does_mount("-o", "remount,ro,bind", str(folder)):
+                break
+            time.sleep(0.02)
+        else:
+            raise ImpossibleHereError("needs the right to mount read-only")
         yield
     finally:
         subprocess.run(["umount", "-l", str(folder)], check=True)
