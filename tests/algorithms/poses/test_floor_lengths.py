@@ -1,4 +1,4 @@
-"""Lengths from the floor under upright cameras."""
+"""Lengths from the floor under upright cameras, and those that observations leave open."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.refine import floor_lengths
+from pano_mvs.algorithms.poses.adjustment.refine import _adjusted, _Settings, floor_lengths, pairs_of_scales
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
 
@@ -87,8 +87,8 @@ def test_heights_of_two_kinds_are_uncertain() -> None:
     alike, different = (floor_lengths(bundle, scale_rad=SCALE_RAD) for bundle in (true, longer_second_room(true, 1.5)))
     assert alike is not None
     assert different is not None
-    assert alike.std < 0.05
-    assert different.std > 0.15
+    assert alike.stds.max() < 0.05
+    assert different.stds.min() > 0.15
 
 
 def test_cameras_at_many_heights_are_left_where_rays_put_them() -> None:
@@ -134,3 +134,59 @@ def test_nothing_is_expected_without_evidence(what: str) -> None:
             bearings=bundle.bearings[kept],
         )
     assert floor_lengths(bundle, scale_rad=SCALE_RAD) is None
+
+
+def through_a_door(rng: np.random.Generator, *, false: bool) -> Bundle:
+    """Return three cameras in a room, and two in the next one, of which only the first sees a camera's points.
+
+    `false`: whether there is also a point of cameras 0 and 3 that belongs where the second room is twice as far away.
+    """
+    centers = np.array([[0.0, 0, 0], [1.5, 0, 1], [2.5, 0, 0], [5.0, 0, 0.3], [6.5, 0, -0.5]])
+    sees = [([0, 1, 2], (-1, 3), 80), ([2, 3], (3, 5), 50), ([3, 4], (5, 8), 80)]
+    points: list[FloatArray] = []
+    point_idx: list[int] = []
+    image_idx: list[int] = []
+    for cameras, (low, high), count in sees:
+        for point in rng.uniform((low, -1.2, -3), (high, 1.2, 3), (count, 3)):
+            point_idx += [len(points)] * len(cameras)
+            image_idx += cameras
+            points.append(point)
+    origins = centers[image_idx]
+    if false:
+        origins = np.concatenate([origins, [centers[0], centers[2] + 2 * (centers[3] - centers[2])]])
+        point_idx += [len(points)] * 2
+        image_idx += [0, 3]
+        points.append(np.array([20.0, 1.0, 60.0]))
+    rays = np.array(points)[point_idx] - origins
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays += np.deg2rad(0.02) * rng.standard_normal(rays.shape)
+    return Bundle(
+        np.tile(np.eye(3), (5, 1, 1)),
+        centers,
+        np.array(points),
+        np.array(point_idx, np.int32),
+        np.array(image_idx, np.int32),
+        rays / np.linalg.norm(rays, axis=1)[:, None],
+    )
+
+
+def test_each_part_with_a_scale_of_its_own_has_a_pair() -> None:
+    bundle = through_a_door(np.random.default_rng(4), false=True)
+    first, door, second = sorted(pairs_of_scales(bundle).tolist())
+    assert set(first) < {0, 1, 2}
+    assert (door, second) == ([2, 3], [3, 4])
+    room = captured(standing(np.ones(9), np.random.default_rng(0)), np.random.default_rng(0))
+    assert len(pairs_of_scales(room)) == 2  # both rooms, by the camera in the door
+    nothing = replace(bundle, points=np.zeros((0, 3)), point_idx=bundle.point_idx[:0], image_idx=bundle.image_idx[:0])
+    assert pairs_of_scales(nothing).shape == (0, 2)
+
+
+def test_a_false_match_does_not_move_what_hangs_on_one_pair() -> None:
+    bundle = through_a_door(np.random.default_rng(4), false=True)
+    distance = 2.52
+    alone = adjust_bundle(bundle, RobustLoss("cauchy", SCALE_RAD), max_iterations=200)
+    assert np.linalg.norm(alone.centers[3] - alone.centers[2]) > 1.5 * distance
+    settings = _Settings("cauchy", 0.1, 0.4, 200)
+    found, _ = _adjusted(bundle, np.zeros((len(bundle.points), 3), np.uint8), settings, rounds=3)
+    baselines = found.centers[2] - found.centers[0], found.centers[3] - found.centers[2]
+    assert np.linalg.norm(baselines[1]) / np.linalg.norm(baselines[0]) == pytest.approx(distance / 2.5, rel=0.05)

@@ -48,8 +48,17 @@ class Lengths:
 
     pairs: NDArray[np.intp]  # (K, 2) positions of the cameras of each baseline
     lengths: FloatArray  # (K,) the expected distances of their centres
-    std: float  # standard deviation of the logarithm of each
+    stds: FloatArray  # (K,) standard deviation of the logarithm of each
     weight: float  # of their squared deviations relative to that of rays, in units of the scale of their loss
+
+    def __add__(self, other: Lengths) -> Lengths:
+        """Return the lengths of both, with the weight of the first."""
+        return Lengths(
+            np.concatenate([self.pairs, other.pairs]),
+            np.concatenate([self.lengths, other.lengths]),
+            np.concatenate([self.stds, other.stds]),
+            self.weight,
+        )
 
     def in_order(self, place: NDArray[np.intp]) -> Lengths:
         """Return the lengths after camera n has got position place[n]."""
@@ -78,8 +87,8 @@ class Lengths:
         """Return by how many standard deviations lengths differ, and the derivatives by the first centres (K, 3)."""
         baselines = centers[self.pairs[:, 0]] - centers[self.pairs[:, 1]]
         squares = np.sum(baselines**2, axis=1)
-        deviations = (np.log(squares) / 2 - np.log(self.lengths)) / self.std
-        return deviations, baselines / squares[:, None] / self.std
+        deviations = (np.log(squares) / 2 - np.log(self.lengths)) / self.stds
+        return deviations, baselines / (squares * self.stds)[:, None]
 
 
 @dataclass(frozen=True, eq=False)

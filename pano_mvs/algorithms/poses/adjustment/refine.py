@@ -9,6 +9,8 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
@@ -211,6 +213,8 @@ def _adjusted(
 ) -> tuple[Bundle, NDArray[np.uint8]]:
     """Return one group's bundle after some rounds of adjustment, without outliers."""
     max_error_rad = float(np.deg2rad(settings.max_error_deg)) * widen
+    pairs = pairs_of_scales(bundle)
+    lengths = np.linalg.norm(bundle.centers[pairs[:, 0]] - bundle.centers[pairs[:, 1]], axis=1)
     for round_idx in range(rounds):
         # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
         wider = 2 ** (rounds - 1 - round_idx) * widen
@@ -228,8 +232,14 @@ def _adjusted(
         )
         bundle, colors = _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
         loss = settings.robust(wider)
+        known = floor_lengths(bundle, scale_rad=loss.scale_rad)
+        if len(pairs) > 1:
+            before = Lengths(
+                pairs, lengths, np.full(len(pairs), _LENGTH_STD), _weight_of_lengths(bundle, loss.scale_rad)
+            )
+            known = known + before if known else before
         bundle = adjust_bundle(
-            replace(bundle, lengths=floor_lengths(bundle, scale_rad=loss.scale_rad)),
+            replace(bundle, lengths=known),
             loss,
             max_iterations=settings.max_iterations,
             tolerance=_TOLERANCES[round_idx - rounds] if widen == 1 else _TOLERANCES[0],
@@ -333,6 +343,8 @@ def _poses(
 # The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
 # with this many points, and more than twice as many as any other.
 _REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
+# Of the logarithm of a length that observations leave open: of one that the floor determines before.
+_LENGTH_STD = 0.06
 
 
 def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
@@ -365,9 +377,42 @@ def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
     same = np.abs(differences) < 0.25
     # What is known of the spread of heights before any is measured.
     std = max(0.02, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
+    lengths = (baselines * np.exp(-differences))[same]
+    return Lengths(pairs[same], lengths, np.full(len(lengths), std), _weight_of_lengths(bundle, scale_rad))
+
+
+def _weight_of_lengths(bundle: Bundle, scale_rad: float) -> float:
+    """Return the weight of lengths in standard deviations relative to that of rays in units of the scale."""
     # 1.39 is the squared median of the length of a normal vector of variance 1 in each of two directions.
-    weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / 1.39
-    return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
+    return float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / 1.39
+
+
+def pairs_of_scales(bundle: Bundle) -> NDArray[np.intp]:
+    """Return a pair of cameras (K, 2) of each part of a bundle with a scale of its own, that which shares most points.
+
+    Points that three cameras see, or three pairs of three cameras, tie the lengths of these pairs to one another. What
+    hangs on a single pair, such as a room that two panoramas see through a door, can be at any distance along its
+    direction, and drifts.
+    """
+    count = len(bundle.centers)
+    seen = coo_array(
+        (np.ones(len(bundle.point_idx), np.int32), (bundle.point_idx, bundle.image_idx)), (len(bundle.points), count)
+    ).tocsr()
+    seen.data[:] = 1
+    shared = (seen.T @ seen).toarray()
+    first, second = np.nonzero(np.triu(shared, 1) >= _MIN_POINTS)
+    number = np.full((count, count), -1, np.int32)
+    number[first, second] = number[second, first] = np.arange(len(first))
+    rows, columns = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)]
+    for edge, (one, other) in enumerate(zip(first, second, strict=True)):
+        thirds = np.flatnonzero((number[one] >= 0) & (number[other] >= 0))
+        columns += [number[one, thirds], number[other, thirds]]
+        rows.append(np.full(2 * len(thirds), edge))
+    at = np.concatenate(rows), np.concatenate(columns)
+    _, part = connected_components(coo_array((np.ones(len(at[0])), at), (len(first), len(first))), directed=False)
+    best = np.lexsort((-shared[first, second], part))
+    chosen = best[np.flatnonzero(np.diff(part[best], prepend=-1))]
+    return np.column_stack([first, second])[chosen]
 
 
 def _heights(bundle: Bundle, down: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
