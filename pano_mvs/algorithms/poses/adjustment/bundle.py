@@ -88,7 +88,7 @@ class Lengths:
         baselines = centers[self.pairs[:, 0]] - centers[self.pairs[:, 1]]
         squares = np.sum(baselines**2, axis=1)
         deviations = (np.log(squares) / 2 - np.log(self.lengths)) / self.stds
-        return deviations, baselines / (squares * self.stds)[:, None]
+        return deviations, baselines / squares[:, None] / self.stds[:, None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -233,10 +233,11 @@ def _adjusted(
         bundle, colors = _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
         loss = settings.robust(wider)
         known = floor_lengths(bundle, scale_rad=loss.scale_rad)
-        if len(pairs) > 1:
-            before = Lengths(
-                pairs, lengths, np.full(len(pairs), _LENGTH_STD), _weight_of_lengths(bundle, loss.scale_rad)
-            )
+        # Only cameras that still share points are beside each other in the system of the cameras.
+        kept = [np.isin(*(bundle.point_idx[bundle.image_idx == camera] for camera in pair)).any() for pair in pairs]
+        if len(pairs) > 1 and any(kept):
+            stds = np.full(np.count_nonzero(kept), _LENGTH_STD)
+            before = Lengths(pairs[kept], lengths[kept], stds, _weight_of_lengths(bundle, loss.scale_rad))
             known = known + before if known else before
         bundle = adjust_bundle(
             replace(bundle, lengths=known),
