@@ -29,6 +29,7 @@ _ARGUMENTS = (
     "--no-first-run",
     "--enable-unsafe-swiftshader",
     "--use-angle=swiftshader",
+    "--disable-gpu-watchdog",  # it ends the process that draws, and with it all contexts, on a machine that is busy
     "--hide-scrollbars",
 )
 
@@ -50,8 +51,10 @@ class Chromium(Browser):
         self.root = root
 
     def open(self, address: str) -> None:
-        """Load a page."""
+        """Load a page, and wait until it is the one that scripts see."""
+        self.evaluate("window.isEarlierPage = true")
         _call("POST", f"{self.root}/url", {"url": address})
+        self.wait("!window.isEarlierPage && document.readyState === 'complete'")
 
     def resize(self, width: int, height: int) -> None:
         """Set the size of the area that shows the page."""
