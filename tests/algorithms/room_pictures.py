@@ -67,7 +67,13 @@ def room_matches(
         feigned: images that most matches with the others place elsewhere, by so much; the truth is the runner-up.
         false: number of points that such matches have; the true ones have 60.
     """
-    poses, _ = room_capture()
+    return matches_of(room_capture()[0], feigned, false=false)
+
+
+def matches_of(
+    poses: Sequence[Rigid3], feigned: Mapping[int, Vector] | None = None, *, false: int = 60
+) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
+    """Return the same as `room_matches`, of other cameras in the room."""
     feigned = feigned or {}
     rng = np.random.default_rng(23)
     rays = rng.normal(size=(60, 3))

@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.poses.joining.alignment import Alignment
+from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
-from pano_mvs.algorithms.poses.joining.floors import height_above_floor
-from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _Joint, _PairEvidence
+from pano_mvs.algorithms.poses.joining.floors import KnownLengths, height_above_floor, height_over_points
+from pano_mvs.algorithms.poses.joining.join_groups import (
+    _alignments_with,
+    _is_rival,
+    _is_significant,
+    _Joint,
+    _PairEvidence,
+)
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
@@ -309,13 +315,13 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _drawn(count: int = 60) -> tuple[Similarity3, CrossMatches]:
+def _drawn(count: int = 60, noise: float = 0.02) -> tuple[Similarity3, CrossMatches]:
     rng = np.random.default_rng(8)
     similarity = Similarity3(1.7, rotation_from_rotvec(rng.normal(size=3)), rng.normal(size=3))
     centers = rng.normal(size=(count, 2, 3))
     second = 4 * rng.normal(size=(count, 3))
     offsets = np.stack([similarity.apply(second) - centers[:, 0], second - centers[:, 1]], axis=1)
-    rays = _unit(offsets + rng.normal(0, 0.02, offsets.shape))
+    rays = _unit(offsets + rng.normal(0, noise, offsets.shape))
     ranges = np.linalg.norm(offsets, axis=2)
     ranges[::3, 0] = np.nan
     ranges[::4, 1] = np.nan
@@ -410,6 +416,59 @@ def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
     }
     assert height_above_floor(_models(room_features(raised, door=0, own=600), raised, unit=1.0)[0]) == 0
     assert height_above_floor(_models(room_features(truth, door=0, own=10), truth, unit=1.0)[0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("raised", "known"),
+    [
+        ([0.0] * 10, True),
+        ([0.0] * 8 + [0.12, 0.18], True),  # by the slope between joined models
+        ([0.0] * 9 + [0.3], False),  # on a platform
+        ([0.0] * 9 + [2.0], False),  # on another storey
+        ([0.0] * 5 + [0.12] * 5, False),
+    ],
+)
+def test_a_few_cameras_may_be_placed_less_exactly(raised: list[float], known: bool) -> None:
+    """They are raised by shares of the height of most cameras."""
+    rng = np.random.default_rng(3)
+    floor = np.column_stack([rng.uniform(-4, 4, 500), rng.normal(1.5, 0.01, 500), rng.uniform(-4, 4, 500)])
+    cameras = [
+        Rigid3.from_center(np.eye(3), np.array([0.5 * idx - 2, -1.5 * share, 0.1])) for idx, share in enumerate(raised)
+    ]
+    height = height_over_points(floor, cameras, [np.array([0.0, -1.0, 0.0])] * len(cameras))
+    assert height == (pytest.approx(1.5, rel=0.03) if known else 0.0)
+
+
+def test_alignments_of_parts_are_those_of_the_joined_model() -> None:
+    rng = np.random.default_rng(8)
+    worlds = [
+        Similarity3(scale, rotation_from_rotvec(rng.uniform(-1, 1, 3)), rng.uniform(-2, 2, 3))
+        for scale in (1.0, 2.0, 0.5, 3.0, 0.7)
+    ]
+    joints = {
+        (a, b): _Joint(
+            replace(_alignment(-40), first_from_second=worlds[a].inverse() @ worlds[b]),
+            _PairEvidence({}, 0.0, has_length=True),
+            False,
+        )
+        for a, b in ((0, 1), (0, 2), (3, 1))
+    }
+    point = np.array([[0.3, -0.2, 1.4]])
+    for third, count in ((2, 1), (3, 1), (4, 0)):
+        found = list(_alignments_with(third, (0, 1), joints))
+        assert len(found) == count
+        for each in found:
+            np.testing.assert_allclose(worlds[0].apply(each.apply(point)), worlds[third].apply(point), atol=1e-9)
+
+
+def test_a_start_is_refined_without_any_pair_that_suggests_it() -> None:
+    similarity, matches = _drawn(200, noise=1e-3)
+    assert align_models(matches, hypotheses={}, known=KnownLengths(), has_scale=True) == []
+    off = Similarity3(1.002, rotation_from_rotvec(np.array([0.002, -0.001, 0.001])), np.array([0.005, 0.0, -0.004]))
+    (found,) = align_models(matches, hypotheses={}, starts=[off @ similarity], known=KnownLengths(), has_scale=True)
+    assert found.first_from_second.scale == pytest.approx(similarity.scale, rel=2e-4)
+    np.testing.assert_allclose(found.first_from_second.rotation, similarity.rotation, atol=5e-4)
+    np.testing.assert_allclose(found.first_from_second.translation, similarity.translation, atol=2e-3)
 
 
 @pytest.mark.slow

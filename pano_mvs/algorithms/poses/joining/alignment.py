@@ -45,6 +45,7 @@ def align_models(
     *,
     has_scale: bool,
     hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
+    starts: Sequence[Similarity3] = (),
     known: KnownLengths,
 ) -> list[Alignment]:
     """Return the similarities of two models on which most of their matches agree, best first.
@@ -57,6 +58,7 @@ def align_models(
         matches: between the images of the two models.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
         hypotheses: relative poses of pairs of images.
+        starts: further similarities to be refined.
         known: what is known of the lengths from elsewhere.
     """
     if not matches.known.any() and not len(known.lengths):
@@ -69,7 +71,7 @@ def align_models(
             proposals += [_with_lengths(one, centers, matches, scale=known.scale) for one in some]
     finalists = [
         _refined(start, matches, known, has_scale=has_scale and known.scale is None)
-        for start in sorted(proposals, key=matches.cost)[:10]
+        for start in [*starts, *sorted(proposals, key=matches.cost)[:10]]
     ]
     finalists.sort(key=lambda finalist: matches.cost(finalist[0]))
     return [_measured(*finalist, matches) for finalist in finalists]

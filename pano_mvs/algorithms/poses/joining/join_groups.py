@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
@@ -35,18 +36,20 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
     points, and the matches of all its images count together, verified or not: a match with a known point fixes two
     angles instead of one, and seven numbers align two models with dozens of pairs (see `align_models`). Models are
     joined if the matches determine the alignment, if these are far more than chance, and if no other alignment is
-    nearly as good. The most significant alignment is the first.
+    nearly as good. The most significant alignment is the first; those that were found of its two models before are
+    tried again with the joined one.
 
     Args:
         models: of the same pairs, without common images; the world of the largest part is kept.
     """
     left: dict[int, Part] = {number: (model, (number,)) for number, model in enumerate(models)}
     tried: dict[tuple[int, int], _Joint | None] = {}
+    starts: dict[tuple[int, int], list[Similarity3]] = defaultdict(list)
     numbers = count(len(models))
     while True:
         for pair in _promising({number: model for number, (model, _) in left.items()}):
             if pair not in tried:
-                tried[pair] = _certain_joint(left[pair[0]][0], left[pair[1]][0])
+                tried[pair] = _certain_joint(left[pair[0]][0], left[pair[1]][0], starts[pair])
         usable = {pair: one for pair, one in tried.items() if one is not None and left.keys() >= {*pair}}
         if not usable:
             return list(left.values())
@@ -54,7 +57,24 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
         (first, one), (second, other) = (left.pop(number) for number in best)
         joined = joined_model(first, second, usable[best].alignment.first_from_second)
         joined.verify_again()
-        left[next(numbers)] = joined, tuple(sorted((*one, *other)))
+        new = next(numbers)
+        for third in left:
+            for own_from_third in _alignments_with(third, best, usable):
+                starts[new, third].append(own_from_third)
+                starts[third, new].append(own_from_third.inverse())
+        left[new] = joined, tuple(sorted((*one, *other)))
+
+
+def _alignments_with(
+    third: int, joined: tuple[int, int], usable: Mapping[tuple[int, int], _Joint]
+) -> Iterator[Similarity3]:
+    """Yield what moves a third model into the world of two joined ones, by its alignments with either."""
+    world_from = Similarity3(1.0, np.eye(3), np.zeros(3)), usable[joined].alignment.first_from_second
+    for part, world_from_part in zip(joined, world_from, strict=True):
+        if (part, third) in usable:
+            yield world_from_part @ usable[part, third].alignment.first_from_second
+        elif (third, part) in usable:
+            yield world_from_part @ usable[third, part].alignment.first_from_second.inverse()
 
 
 def _promising(models: Mapping[int, PlacedModel]) -> Iterator[tuple[int, int]]:
@@ -90,10 +110,11 @@ class _Joint(NamedTuple):
         return self.pairs.agreeing if self.learned else max(by_matches, self.pairs.agreeing)
 
 
-def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
+def _certain_joint(first: PlacedModel, second: PlacedModel, starts: Sequence[Similarity3]) -> _Joint | None:
     """Return the alignment of two models by the matches between them; None if these do not determine it.
 
     Their heights above the floor are equal where both are known, which determines lengths that matches hardly do.
+    `starts`: alignments that were certain for parts of the models, tried beside those that pairs suggest.
     """
     views = _views_between(first, second)
     matches = CrossMatches.between(first, second, views)
@@ -113,7 +134,7 @@ def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
             hypotheses[pair] = [replace(own, lengths=(length, length / scale)), *others]
     known = KnownLengths.between(first, second, lengths, scale=scale)
     # Of the alignments with which many learned matches agree, the most significant one; the others may rival it.
-    found = align_models(matches, hypotheses=hypotheses, known=known, has_scale=has_scale)
+    found = align_models(matches, hypotheses=hypotheses, starts=starts, known=known, has_scale=has_scale)
     certain: list[_Joint] = []
     for one in _distinct(found, first, second) if learned else found[:1]:
         if one.rotation_std_deg > 1.0 or one.offset_std_deg > 3.0 or one.scale_std > 0.1:

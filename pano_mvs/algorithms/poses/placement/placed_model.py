@@ -205,14 +205,14 @@ class PlacedModel:
         model.choose_again()
         return model
 
-    def held_by(self, images: Collection[int]) -> list[int]:
-        """Return the images that only pairs with some of the images connect to the largest part of the others."""
+    def groups_held_by(self, images: Collection[int]) -> list[list[int]]:
+        """Return the groups of images that only pairs with some of the images connect to the largest of the groups."""
         if not images:
             return []
         left = [edge for edge in self.chosen if not {*edge} & {*images}]
         connected = {image for edge in self.chosen for image in edge} - {*images}
-        largest = max((connected & {*group} for group in connected_groups(left, len(self.pairs.names))), key=len)
-        return sorted(connected - largest)
+        groups = [sorted(connected & {*group}) for group in connected_groups(left, len(self.pairs.names))]
+        return sorted((group for group in groups if group), key=lambda group: (-len(group), group))[1:]
 
     def seed(self, edge: Edge, rank: int) -> None:
         """Start with a pair of images, in the frame of the first image, one unit of length apart."""

@@ -31,6 +31,8 @@ class CameraChecks:
     p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
     doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
     removed: dict[int, str] = field(default_factory=dict)  # images that were removed from the model, with the reason
+    # models of two or more cameras that a removed one alone held: right among themselves, perhaps, and not checked yet
+    split_off: list[PlacedModel] = field(default_factory=list)
     links_contradicting: float = np.nan  # largest share of the weight of learned pairs that contradicted the cameras
     refuted: dict[int, list[Rigid3]] = field(default_factory=dict)  # image position to poses that the images refute
     # doubtful images with another place that the images do not refute, or that was not compared; None: not compared
@@ -45,7 +47,8 @@ def correct_cameras(
     """Check all cameras of a model by the images, and correct those for which the images prefer another pose.
 
     Doubtful cameras are tried at the other poses that their pairs suggest, and move only if all cameras together are
-    confirmed more (see `is_more_confirmed`). A camera that is surely wrong is left out unless others lose by it.
+    confirmed more (see `is_more_confirmed`). A camera that is surely wrong is left out unless others lose by it. Two or
+    more cameras that it alone connected to the others are a model of their own from then on.
 
     Args:
         model: a model with two or more cameras.
@@ -189,6 +192,8 @@ def _without_worst(
 ) -> PlacedModel | None:
     """Return the model without the camera that is wrong most surely, and without those that only it holds.
 
+    Of these, each that is alone is removed as well; the others are split off.
+
     It is None if no camera is wrong surely enough, if others would be confirmed less without it, or if fewer than three
     are left. Whether others are confirmed less is only asked where each of them keeps its number of sources: fewer ones
     confirm less, wherever they are. The others may have been doubted because of it, so they are to be judged again.
@@ -196,7 +201,8 @@ def _without_worst(
     worst = min(found.p_right.keys() - fixed, key=lambda image: (found.p_right[image], image), default=None)
     if worst is None or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
         return None
-    gone = {worst, *model.held_by([worst])}
+    held = model.groups_held_by([worst])
+    gone = {worst, *(image for group in held for image in group)}
     cameras = {image: camera for image, camera in model.cameras.items() if image not in gone}
     if len(cameras) <= 2:
         return None
@@ -204,6 +210,9 @@ def _without_worst(
         shares, before = confirmation.parallax_shares(cameras), confirmation.parallax_shares(model.cameras)
         if is_more_confirmed({image: share for image, share in before.items() if image not in gone}, shares):
             return None
-    held = dict.fromkeys(sorted(gone - {worst}), "its pairs are all with images that were left out")
-    found.removed |= {worst: found.doubts[worst]} | held
+    alone = {group[0]: "its pairs are all with images that were left out" for group in held if len(group) == 1}
+    found.removed |= {worst: found.doubts[worst]} | alone
+    found.split_off += [
+        model.with_cameras({image: model.cameras[image] for image in group}) for group in held if len(group) > 1
+    ]
     return model.with_cameras(cameras)

@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
+from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
 from pano_mvs.algorithms.poses.placement.placed_model import NO_FEATURES, Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.belief.doubts import MISS_COST
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
@@ -86,19 +87,26 @@ class _Capture:
         return pairs_of(self.features, inside) if self.features else Pairs.without(self.names)
 
     def model(self, group: Poses) -> PlacedModel:
-        """Return the cameras of a group, with the pairs among its images."""
+        """Return the cameras of a group, with the pairs among its images, also those that its poses explain alone."""
         cameras = {self.position[name]: pose for name, pose in group.cameras.items()}
-        return PlacedModel(self.pairs_among(group.names)).with_cameras(cameras)
+        model = PlacedModel(self.pairs_among(group.names)).with_cameras(cameras)
+        model.verify_again()
+        return model
 
 
 def _verified(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
     """Return poses whose groups are checked and corrected."""
-    groups = [_verified_group(group, capture, correct=correct, miss_cost=miss_cost) for group in split_groups(poses)]
+    groups = []
+    waiting = split_groups(poses)[::-1]
+    while waiting:
+        group, split_off = _verified_group(waiting.pop(), capture, correct=correct, miss_cost=miss_cost)
+        groups.append(group)
+        waiting += split_off[::-1]
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
 
 
-def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
-    """Return poses of one group that are checked and corrected."""
+def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> tuple[Poses, list[Poses]]:
+    """Return poses of one group that are checked and corrected, and of groups that were split off, not checked yet."""
     model = capture.model(poses)
     pairs = model.pairs
     fixed = () if correct and pairs.compared else [*model.cameras]
@@ -106,7 +114,8 @@ def _verified_group(poses: Poses, capture: _Capture, *, correct: bool, miss_cost
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), **poses.worlds[0]._asdict())
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return with_camera_checks(poses, pairs, checks)
+    split_off = [normalised_poses(poses_of(part)) for part in checks.split_off]
+    return with_camera_checks(poses, pairs, checks), split_off
 
 
 def poses_of(model: PlacedModel) -> Poses:

@@ -17,7 +17,7 @@ from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
-from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
+from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, matches_of, moved, room_capture, room_matches
 from tests.known import known
 from tests.synthetic.scenes import white_room
 from tools.benchmarks.poses.placements import judge_placements
@@ -171,6 +171,44 @@ def test_an_image_of_another_place_is_left_out_with_the_reason(matches: Matches)
     assert found.doubts == {}
     for name in found.names:
         assert bytes_of(found, name) == bytes_of(given, name)
+
+
+@pytest.mark.slow
+def test_what_hangs_on_an_image_of_another_place_becomes_a_group() -> None:
+    """Regression: in a tour, six right cameras were lost with the one camera that tied them to the others."""
+    poses = tuple(capture_poses(7, seed=1, spread=0.7))
+    pictures = [render(default_room(), pose, SIZE_HW)[0] for pose in poses]
+    pictures[3] = np.roll(render(default_room(seed=9), capture_poses(2, seed=8)[1], SIZE_HW)[0], 40, axis=1)
+    features, views = matches_of(poses)
+    rng = np.random.default_rng(3)
+    names = tuple(features)
+    for (first, second), view in views.items():
+        ends = {names.index(first), names.index(second)}
+        if 3 in ends and max(ends) < 6:
+            direction = rng.normal(size=3)
+            wrong = np.stack([np.arange(40), rng.permutation(40)], axis=1).astype(np.int32)
+            views[first, second] = view_of(Rigid3(view.rotation, direction / np.linalg.norm(direction)), wrong)
+    # 4 and 5 hang on 3, and so does 6 alone.
+    apart = {pair: view for pair, view in views.items() if tied(*(names.index(name) for name in pair))}
+    given = poses_of(dict(zip(names, poses, strict=True)))
+    found = verify_poses(given, lambda name: (pictures[names.index(name)], WHOLE), features=features, two_views=apart)
+    found.check()
+    whole, held = split_groups(found)
+    assert whole.names == names[:3]
+    assert held.names == names[4:6]
+    assert (whole.metric, held.metric) == (True, False), "nothing tells the scale of what hung on a wrong camera"
+    assert set(found.rejected) == {names[3], names[6]}
+    assert held.right_probabilities is not None
+    between = held.cam_from_world(1) @ held.cam_from_world(0).inverse()
+    true = poses[5] @ poses[4].inverse()
+    assert np.rad2deg(geodesic_angle(between.rotation, true.rotation)) < 0.5
+    assert np.linalg.norm(between.translation) == pytest.approx(1.0)
+    assert between.translation @ true.translation > 0.999 * np.linalg.norm(true.translation)
+
+
+def tied(first: int, second: int) -> bool:
+    ends = {first, second}
+    return any(ends <= group for group in ({0, 1, 2, 3}, {3, 4, 5}, {3, 6}))
 
 
 def test_two_cameras_are_judged_and_doubted_only_if_their_pair_is_ambiguous(matches: Matches) -> None:
