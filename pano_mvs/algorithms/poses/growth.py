@@ -174,7 +174,7 @@ def _next(model: PlacedModel, weights: Mapping[int, float], *, reasons: dict[int
 
 def _polished(model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement) -> tuple[Rigid3, str]:
     """Return the refined pose of a placement, and why it is refused if too few known points support it."""
-    pose, support, known = model.polished(image, evidence, placement)
+    pose, support, known = model.polished_near_pairs(image, evidence, placement)
     agreeing = len(set(evidence.partner[placement.explained].tolist()))
     if support >= points_needed(known, agreeing=agreeing):
         return pose, ""

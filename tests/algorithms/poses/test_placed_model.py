@@ -13,7 +13,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import (
     pairs_of,
 )
 from pano_mvs.algorithms.poses.placement.resection import points_needed, resection_errors
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.geometry.pose_errors import relative_pose_errors
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture, shifted_pose
 
@@ -97,6 +97,27 @@ def test_points_of_a_false_geometry_are_elsewhere(model: PlacedModel, capture: A
     )
     assert there < 0.2
     assert here > 2
+
+
+def test_false_points_do_not_move_a_camera_away_from_its_pairs(
+    model: PlacedModel, capture: AliasedCapture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: in a real tour, 19 of 43 known points turned a camera by 4°, and twelve others hung on it."""
+    model = model.with_cameras({image: camera for image, camera in model.cameras.items() if image != 3})
+    evidence, found = model.place(3)
+    placed = found[0].cam_from_world
+    points = model.known_points(3, explained_partners(evidence, found[0].explained))[0]
+    for turned_deg, kept in ((0.5, False), (4.0, True)):
+        turn = rotation_from_rotvec([0.0, np.deg2rad(turned_deg), 0.0])
+        elsewhere = Rigid3.from_center(turn @ placed.rotation, placed.center)
+        seen = elsewhere.apply(points)
+        rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+        monkeypatch.setattr(model, "known_points", lambda *_, rays=rays: (points, rays))
+        pose, support, known = model.polished_near_pairs(3, evidence, found[0])
+        expected = placed if kept else elsewhere
+        np.testing.assert_allclose(pose.rotation, expected.rotation, atol=1e-6)
+        assert known == len(points)
+        assert support == known if not kept else support < points_needed(known)
 
 
 def test_an_image_is_placed_and_polished_where_it_stands(model: PlacedModel, capture: AliasedCapture) -> None:

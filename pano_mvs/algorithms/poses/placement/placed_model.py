@@ -21,7 +21,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
     oriented,
 )
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
-from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, refined_on_points
+from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, points_seen, refined_on_points
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
 from pano_mvs.algorithms.two_view.verification import verify_pose, weight_of_pair
 from pano_mvs.core.arrays import FloatArray
@@ -252,6 +252,18 @@ class PlacedModel:
         if len(points) < MIN_POINTS:
             return pose, 0, len(points)
         return *refined_on_points(pose, points, rays), len(points)
+
+    def polished_near_pairs(self, image: int, evidence: PairEvidence, placement: Placement) -> tuple[Rigid3, int, int]:
+        """Return the same, or the placement as it is if known points move it to where none of its pairs agrees.
+
+        Such points are false, or the place is; the placement is then judged by what it sees from there. Where images
+        confirm a place, it may be moved, since the direction to a camera nearby is not well known.
+        """
+        pose, support, known = self.polished(image, evidence, placement)
+        if (agreement(evidence, pose.rotation[None], pose.center[None])[0] & placement.explained).any():
+            return pose, support, known
+        points, rays = self.known_points(image, explained_partners(evidence, placement.explained))
+        return placement.cam_from_world, points_seen(placement.cam_from_world, points, rays), known
 
     def adjust(self, *, cameras: bool = True) -> None:
         """Refine all cameras except the first together with the points, and compute all ranges again.

@@ -28,7 +28,12 @@ def refined_on_points(cam_from_world: Rigid3, points_in_world: FloatArray, beari
     pose = cam_from_world
     for scale_rad in (float(np.deg2rad(1.0)), MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
         pose = refine_resection(pose, points_in_world, bearings, scale_rad=scale_rad)
-    return pose, int((resection_errors(pose, points_in_world, bearings) < MAX_ERROR_RAD).sum())
+    return pose, points_seen(pose, points_in_world, bearings)
+
+
+def points_seen(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> int:
+    """Return the number of points that a camera sees where they should be."""
+    return int((resection_errors(cam_from_world, points_in_world, bearings) < MAX_ERROR_RAD).sum())
 
 
 def points_needed(known: int, *, agreeing: int = 1) -> int:
