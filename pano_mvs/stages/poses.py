@@ -108,21 +108,36 @@ def verify(
     Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
     confirm, and the share to be expected. These and the pairs give the probability that the camera is right. A doubtful
     one is moved if the images confirm more of all cameras with another pose that its matches suggest, left out if it is
-    surely wrong, or reported. Without features and matches the stage only reports.
+    surely wrong, or reported. Two or more cameras that one left out alone connected to the others become a group of
+    their own. Without features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)
     )
-    cameras = poses.cameras
-    moved = [
-        name
-        for name, camera in verified.cameras.items()
-        if name in cameras and not np.array_equal(cameras[name].center, camera.center)
-    ]
+    moved, split_off = changed_places(poses, verified)
     if moved:
         were = plural(len(moved), "was", "were")
         ctx.note(f"{shortened_list(moved)} {were} moved to another place, where the images confirm more of all cameras")
+    for names in split_off:
+        ctx.note(f"{shortened_list(names)} are a group of their own, since a camera that was left out held them")
     return checked_poses(verified, ctx)
+
+
+def changed_places(before: Poses, after: Poses) -> tuple[list[str], list[list[str]]]:
+    """Return the cameras that stand elsewhere in their world, and the groups whose world is new."""
+    moved: list[str] = []
+    split_off: list[list[str]] = []
+    cameras, groups = before.cameras, split_groups(after)
+    grew = len(groups) > len(split_groups(before))
+    for group in groups:
+        own = {name: camera for name, camera in group.cameras.items() if name in cameras}
+        elsewhere = [name for name, camera in own.items() if not np.array_equal(cameras[name].center, camera.center)]
+        # In a new world, one camera may have the centre that it had: the origin.
+        if grew and elsewhere and len(elsewhere) >= max(1, len(own) - 1):
+            split_off.append([*own])
+        else:
+            moved += elsewhere
+    return moved, split_off
 
 
 def panorama_loader(images: Mapping[str, Panorama]) -> Callable[[str], Picture]:

@@ -13,7 +13,8 @@ from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.stages.poses import ScaledTranslationParams, scaled_translation, verify
+from pano_mvs.scene.pose_groups import join_groups
+from pano_mvs.stages.poses import ScaledTranslationParams, changed_places, scaled_translation, verify
 from pano_mvs.stages.views import nearest
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
@@ -68,6 +69,32 @@ def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
     assert ctx.rejected == {}
     assert ctx.metrics["registered"] == 1
     assert ctx.metrics["confirmed_share_median"] > 0.4
+
+
+def test_cameras_of_a_new_group_were_not_moved() -> None:
+    """Their world is another one; the first of them stands at its origin, as it may have done before."""
+    cameras = {
+        f"{name}.png": Rigid3.from_center(np.eye(3), np.array([place, 0.0, 0.0]))
+        for name, place in zip("abcdefg", (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0), strict=True)
+    }
+    before = Poses.without_points(cameras, frame="site", scale="metres", metric=True)
+
+    def group(names: str, shift: float, moved: str = "") -> Poses:
+        centers = {f"{name}.png": cameras[f"{name}.png"].center[0] + shift + (name == moved) for name in names}
+        return Poses.without_points(
+            {name: Rigid3.from_center(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in centers.items()},
+            frame="x",
+            scale="x",
+            metric=False,
+        )
+
+    first, second = "ab", "cdefg"
+    together = join_groups([group(second, 0.0, moved="d"), group(first, 0.0, moved="b")], order=before.names)
+    assert changed_places(before, together) == (["d.png"], [["a.png", "b.png"]])
+    apart = join_groups([group("abcd", 0.0), group("efg", -4.0)], order=before.names)
+    assert changed_places(before, apart) == ([], [["e.png", "f.png", "g.png"]])
+    assert changed_places(before, group("abcdefg", 0.0, moved="c")) == (["c.png"], [])
+    assert changed_places(before, before) == ([], [])
 
 
 @pytest.mark.parametrize(("matched", "correct"), [pytest.param(False, True, marks=pytest.mark.slow), (True, False)])

@@ -443,7 +443,7 @@ def test_alignments_of_parts_are_those_of_the_joined_model() -> None:
     rng = np.random.default_rng(8)
     worlds = [
         Similarity3(scale, rotation_from_rotvec(rng.uniform(-1, 1, 3)), rng.uniform(-2, 2, 3))
-        for scale in (1.0, 2.0, 0.5, 3.0, 0.7)
+        for scale in (1.0, 2.0, 0.5, 3.0, 0.7, 1.2, 0.8, 1.5)
     ]
     joints = {
         (a, b): _Joint(
@@ -451,11 +451,20 @@ def test_alignments_of_parts_are_those_of_the_joined_model() -> None:
             _PairEvidence({}, 0.0, has_length=True),
             False,
         )
-        for a, b in ((0, 1), (0, 2), (3, 1))
+        for a, b in ((0, 1), (0, 2), (3, 1), (1, 5), (6, 0), (0, 7), (7, 1))
     }
     point = np.array([[0.3, -0.2, 1.4]])
-    for third, count in ((2, 1), (3, 1), (4, 0)):
-        found = list(_alignments_with(third, (0, 1), joints))
+    for third, sizes, count in (
+        (2, (3, 3), 1),
+        (3, (3, 3), 1),
+        (4, (3, 3), 0),
+        (5, (3, 3), 1),
+        (6, (3, 3), 1),
+        (7, (3, 3), 2),
+        (7, (3, 1), 1),  # a single camera says nothing of the scale
+        (2, (1, 3), 0),
+    ):
+        found = list(_alignments_with(third, (0, 1), joints, sizes=sizes))
         assert len(found) == count
         for each in found:
             np.testing.assert_allclose(worlds[0].apply(each.apply(point)), worlds[third].apply(point), atol=1e-9)
@@ -468,6 +477,16 @@ def test_a_start_is_refined_without_any_pair_that_suggests_it() -> None:
     (found,) = align_models(matches, hypotheses={}, starts=[off @ similarity], known=KnownLengths(), has_scale=True)
     assert found.first_from_second.scale == pytest.approx(similarity.scale, rel=2e-4)
     np.testing.assert_allclose(found.first_from_second.rotation, similarity.rotation, atol=5e-4)
+    np.testing.assert_allclose(found.first_from_second.translation, similarity.translation, atol=2e-3)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.03])
+def test_a_start_gets_the_scale_that_is_known(factor: float) -> None:
+    similarity, matches = _drawn(200, noise=1e-3)
+    start = replace(similarity, scale=factor * similarity.scale)
+    known = KnownLengths(scale=similarity.scale)
+    (found,) = align_models(matches, hypotheses={}, starts=[start], known=known, has_scale=True)
+    assert found.first_from_second.scale == similarity.scale
     np.testing.assert_allclose(found.first_from_second.translation, similarity.translation, atol=2e-3)
 
 

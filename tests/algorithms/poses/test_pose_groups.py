@@ -105,10 +105,22 @@ def test_a_group_in_one_place_does_not_disturb_the_others() -> None:
 
 @pytest.mark.parametrize(
     ("removed", "held"),
-    [([], []), ([3], [[4]]), ([2], [[3, 4]]), ([0], []), ([1, 3], [[4]]), ([2, 3], [[4]]), ([2, 1], [[0]])],
+    [
+        ([], []),
+        ([3], [[4]]),
+        ([2], [[3, 4]]),
+        ([0], []),
+        ([1, 3], [[4]]),
+        ([2, 3], [[4]]),
+        ([2, 1], [[0]]),
+        ([5], []),
+        ([7], []),
+        ([2, 5], [[3, 4]]),
+    ],
 )
 def test_images_that_hang_on_removed_ones_are_found(removed: list[int], held: list[list[int]]) -> None:
     """In a drawn house, the camera that one pair had placed stayed in the wrong room after its partner was removed."""
-    model = PlacedModel(Pairs.without("abcde"))
-    model.chosen = dict.fromkeys([(0, 1), (1, 2), (0, 2), (2, 3), (3, 4)], 0)
+    model = PlacedModel(Pairs.without("abcdefgh"))
+    # 5 and 6 are connected to nothing else, and 7 to nothing at all.
+    model.chosen = dict.fromkeys([(0, 1), (1, 2), (0, 2), (2, 3), (3, 4), (5, 6)], 0)
     assert model.groups_held_by(removed) == held

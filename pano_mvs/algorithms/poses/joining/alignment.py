@@ -58,7 +58,7 @@ def align_models(
         matches: between the images of the two models.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
         hypotheses: relative poses of pairs of images.
-        starts: further similarities to be refined.
+        starts: further similarities first_from_second to be refined, with the scale that is known if there is one.
         known: what is known of the lengths from elsewhere.
     """
     if not matches.known.any() and not len(known.lengths):
@@ -69,12 +69,20 @@ def align_models(
         if len(pair):
             centers = matches.centers[pair[0]]
             proposals += [_with_lengths(one, centers, matches, scale=known.scale) for one in some]
+    if has_scale and known.scale is not None:
+        starts = [_with_scale(start, matches, scale=known.scale) for start in starts]
     finalists = [
         _refined(start, matches, known, has_scale=has_scale and known.scale is None)
         for start in [*starts, *sorted(proposals, key=matches.cost)[:10]]
     ]
     finalists.sort(key=lambda finalist: matches.cost(finalist[0]))
     return [_measured(*finalist, matches) for finalist in finalists]
+
+
+def _with_scale(start: Similarity3, matches: CrossMatches, *, scale: float) -> Similarity3:
+    """Return a similarity with another scale that leaves the middle of the cameras of the second model in place."""
+    middle = matches.centers[:, 1].mean(axis=0)
+    return Similarity3(scale, start.rotation, start.apply(middle[None])[0] - scale * start.rotation @ middle)
 
 
 def _with_lengths(

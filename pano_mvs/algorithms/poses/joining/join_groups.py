@@ -59,18 +59,25 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
         joined.verify_again()
         new = next(numbers)
         for third in left:
-            for own_from_third in _alignments_with(third, best, usable):
+            for own_from_third in _alignments_with(
+                third, best, usable, sizes=(len(first.cameras), len(second.cameras))
+            ):
                 starts[new, third].append(own_from_third)
                 starts[third, new].append(own_from_third.inverse())
         left[new] = joined, tuple(sorted((*one, *other)))
 
 
 def _alignments_with(
-    third: int, joined: tuple[int, int], usable: Mapping[tuple[int, int], _Joint]
+    third: int, joined: tuple[int, int], usable: Mapping[tuple[int, int], _Joint], *, sizes: tuple[int, int]
 ) -> Iterator[Similarity3]:
-    """Yield what moves a third model into the world of two joined ones, by its alignments with either."""
+    """Yield what moves a third model into the world of two joined ones, by its alignments with either.
+
+    `sizes`: number of cameras of either; a single one has no unit of length, and so says nothing of the scale.
+    """
     world_from = Similarity3(1.0, np.eye(3), np.zeros(3)), usable[joined].alignment.first_from_second
-    for part, world_from_part in zip(joined, world_from, strict=True):
+    for part, world_from_part, size in zip(joined, world_from, sizes, strict=True):
+        if size < 2:
+            continue
         if (part, third) in usable:
             yield world_from_part @ usable[part, third].alignment.first_from_second
         elif (third, part) in usable:

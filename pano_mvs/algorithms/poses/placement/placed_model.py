@@ -206,13 +206,14 @@ class PlacedModel:
         return model
 
     def groups_held_by(self, images: Collection[int]) -> list[list[int]]:
-        """Return the groups of images that only pairs with some of the images connect to the largest of the groups."""
-        if not images:
-            return []
+        """Return the groups of images that only pairs with some images connect to the larger part of their group."""
         left = [edge for edge in self.chosen if not {*edge} & {*images}]
-        connected = {image for edge in self.chosen for image in edge} - {*images}
-        groups = [sorted(connected & {*group}) for group in connected_groups(left, len(self.pairs.names))]
-        return sorted((group for group in groups if group), key=lambda group: (-len(group), group))[1:]
+        parts = [{*part} - {*images} for part in connected_groups(left, len(self.pairs.names))]
+        held = []
+        for group in connected_groups(self.chosen, len(self.pairs.names)):
+            if {*group} & {*images}:
+                held += [sorted(part) for part in parts if part and part <= {*group}][1:]
+        return held
 
     def seed(self, edge: Edge, rank: int) -> None:
         """Start with a pair of images, in the frame of the first image, one unit of length apart."""
@@ -254,10 +255,10 @@ class PlacedModel:
         return *refined_on_points(pose, points, rays), len(points)
 
     def polished_near_pairs(self, image: int, evidence: PairEvidence, placement: Placement) -> tuple[Rigid3, int, int]:
-        """Return the same, or the placement as it is if known points move it to where none of its pairs agrees.
+        """Return what `polished` does, or the placement as it is if no geometry that suggests it agrees any more.
 
-        Such points are false, or the place is; the placement is then judged by what it sees from there. Where images
-        confirm a place, it may be moved, since the direction to a camera nearby is not well known.
+        Known points that move it so far are false, or the place is; it is then judged by what it sees unrefined. Where
+        images confirm the refined pose, `polished` is enough: the direction to a camera nearby is not well known.
         """
         pose, support, known = self.polished(image, evidence, placement)
         if (agreement(evidence, pose.rotation[None], pose.center[None])[0] & placement.explained).any():

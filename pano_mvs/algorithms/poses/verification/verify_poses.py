@@ -41,7 +41,7 @@ def verify_poses(
     most. If it is doubtful still, it is reported, or left out if it is as surely wrong as others are right.
 
     Args:
-        poses: of any origin. Cameras that are not moved keep their poses exactly.
+        poses: of any origin. Cameras that are neither moved nor split off keep their poses exactly.
         load: returns the panorama and the mask of an image by its name.
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
@@ -50,7 +50,8 @@ def verify_poses(
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares`, `evidence`, `right_probabilities` and `doubts`. Points are
-        triangulated again if a camera was moved or left out.
+        triangulated again if a camera was moved or left out. A group that is split off has a world of its own, with the
+        first camera as the frame and the first baseline as the unit.
     """
     if len(poses.names) < 2:
         return poses
@@ -91,17 +92,17 @@ class _Capture:
         cameras = {self.position[name]: pose for name, pose in group.cameras.items()}
         model = PlacedModel(self.pairs_among(group.names)).with_cameras(cameras)
         model.verify_again()
-        return model
+        return model.with_cameras(cameras)
 
 
 def _verified(poses: Poses, capture: _Capture, *, correct: bool, miss_cost: float) -> Poses:
     """Return poses whose groups are checked and corrected."""
     groups = []
-    waiting = split_groups(poses)[::-1]
+    waiting = split_groups(poses)
     while waiting:
         group, split_off = _verified_group(waiting.pop(), capture, correct=correct, miss_cost=miss_cost)
         groups.append(group)
-        waiting += split_off[::-1]
+        waiting += split_off
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
 
 
