@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -10,6 +12,7 @@ from pydantic import Field
 from pano_mvs.algorithms.structure.laid import OtherView
 from pano_mvs.algorithms.structure.lay import MAX_LAID_SOURCES, lay_structure
 from pano_mvs.algorithms.structure.planes import find_structure
+from pano_mvs.algorithms.structure.view import grid_rows
 from pano_mvs.api import (
     All,
     Context,
@@ -62,7 +65,13 @@ class StructureParams(Params):
     enabled: bool = Field(default=True, description="false returns the range maps unchanged")
 
 
-@stage("depth.structure", memory=bytes_per_pixel(200, each_source=12))
+def _structure_memory(params: Params, inputs: Mapping[str, Any]) -> int:
+    rows = grid_rows(inputs["range_map"].range.shape[0])
+    on_grid = 2 * rows * rows * (100 + 20 * len(inputs["planes"]))
+    return on_grid + bytes_per_pixel(200, each_source=12)(params, inputs)
+
+
+@stage("depth.structure", memory=_structure_memory)
 def structure(
     range_map: Each[RangeMap],
     image: Each[Panorama],

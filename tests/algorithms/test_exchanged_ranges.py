@@ -15,10 +15,10 @@ from pano_mvs.algorithms.patchmatch.exchange import (
     offers_of,
     project_range_map,
     respect_free_space,
-    surface_planes,
 )
 from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_pixels, land_nearest
 from pano_mvs.algorithms.patchmatch.refine import reference_arrays, source_arrays
+from pano_mvs.algorithms.patchmatch.window_matches import surface_planes
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama

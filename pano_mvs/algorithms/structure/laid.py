@@ -17,6 +17,8 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Share of a cell of the grid that is not masked.
 _SHOWN = 0.999
+# Relative difference of ranges of two views that are one place.
+_SHARED = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,13 @@ def seen_by(view: OtherView, places: FloatArray) -> Seen:
 
 
 def laid_evidence(
-    own: FloatArray, laid: FloatArray, *, picture: Picture, views: Sequence[Seen], error: float
+    own: FloatArray,
+    laid: FloatArray,
+    *,
+    picture: Picture,
+    views: Sequence[Seen],
+    at_own: Sequence[Seen],
+    error: float,
 ) -> dict[str, FloatArray]:
     """Return what was measured of each pixel (h, w) that has a plane, NaN where it is not known.
 
@@ -80,13 +88,14 @@ def laid_evidence(
         laid: range on its plane.
         picture: (h, w, 3) RGB.
         views: what other views show at its place on the plane.
+        at_own: what they show at the place of its own range.
         error: relative, of ranges that agree.
 
     Returns:
         `nearer` (logarithm of the range on the plane relative to its own, which may be that of something before the
         plane), `unlike` (median difference of its colour, in grey levels, to the views whose own ranges are not nearer
-        than the place), and `through` (sum over the views whose confirmed ranges lie behind the place, of the logarithm
-        of 1 + how many standard deviations).
+        than the place), `shared` (number of views that have a range at its own place), and `through` (sum over the
+        views whose confirmed ranges lie behind the place, of the logarithm of 1 + how many standard deviations).
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         nearer = np.log(laid / own)
@@ -99,6 +108,7 @@ def laid_evidence(
     return {
         "nearer": np.maximum(nearer, 0.0),
         "unlike": _median(unlike, own.shape),
+        "shared": np.sum([np.zeros(own.shape), *(np.abs(seen.ratio - 1) < _SHARED for seen in at_own)], axis=0),
         "through": np.sum([np.zeros(own.shape), *(_through(seen, error) for seen in views)], axis=0),
     }
 

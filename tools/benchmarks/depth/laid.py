@@ -2,10 +2,10 @@
 
 `laid.csv` holds such pixels of rendered captures and houses and of synthetic scenes with true poses, drawn by solid
 angle: whether the plane is nearer to the true range than the pixel's own range, and what `laid_evidence` measured.
-Names that end in “b” are the fifth to ninth view of a capture. Prints, with each place left out in turn, how many of
-the better planes are laid, and of the worse ones. `--data`, `--scene` and `--house` measure places again with the
-preset quality; rows of other places stay as they are. With `--coefficients
-pano_mvs/algorithms/structure/laid_coefficients.py`, the model replaces the one in use.
+"room" and a number is a room of `depth.protruding`. Names that end in “b” are the fifth to ninth view of a capture.
+Prints, with each place left out in turn, how many of the better planes are laid, and of the worse ones. `--data`,
+`--scene`, `--house` and `--room` measure places again with the preset quality; rows of other places stay as they are.
+With `--coefficients pano_mvs/algorithms/structure/laid_coefficients.py`, the model replaces the one in use.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from tools.benchmarks.belief.refit import source_of
 from tools.benchmarks.captures import SCRATCH, Capture, read_capture, scene_capture
 from tools.benchmarks.dense_chain import DenseChain, given_records, true_poses
 from tools.benchmarks.depth.houses import read_house
+from tools.benchmarks.depth.protruding import protruding_room
 from tools.benchmarks.table import print_table
 
 TABLE = Path(__file__).with_name("laid.csv")
-SIGNS = {"nearer": -1, "unlike": -1, "through": -1}
+SIGNS = {"nearer": -1, "unlike": -1, "through": -1, "shared": -1}
 PER_PLACE = 300
 PENALTY = 1.0
 
@@ -123,6 +124,7 @@ def main(
     data: list[Path] | None = None,
     scene: list[str] | None = None,
     house: list[Path] | None = None,
+    room: list[int] | None = None,
     views: int = 5,
     coefficients: Path | None = None,
 ) -> None:
@@ -132,6 +134,7 @@ def main(
         data: captures with truth to measure again.
         scene: synthetic scenes to measure again.
         house: houses of `poses.tours.houses` to measure again, named as there.
+        room: numbers of rooms of `depth.protruding` to measure again.
         views: number of views of each.
         coefficients: file for the fitted model.
     """
@@ -141,6 +144,10 @@ def main(
         scene_capture(SCENES[name](seed=0, exposure=0.0), SCRATCH / f"{name}-512", width=512) for name in scene or ()
     ]
     captures += [read_house(folder, width=512).capture for folder in house or ()]
+    captures += [
+        protruding_room(number, SCRATCH / f"room-{number}-1024", width=1024, views=views).capture
+        for number in room or ()
+    ]
     if captures:
         chain = DenseChain("quality")
         again = [row for capture in captures for row in measured(chain, capture.first(views))]
