@@ -67,7 +67,7 @@ class StructureParams(Params):
 
 def _structure_memory(params: Params, inputs: Mapping[str, Any]) -> int:
     rows = grid_rows(inputs["range_map"].range.shape[0])
-    on_grid = 2 * rows * rows * (100 + 20 * len(inputs["planes"]))
+    on_grid = 2 * rows * rows * (400 + 20 * len(inputs["planes"]))
     return on_grid + bytes_per_pixel(200, each_source=12)(params, inputs)
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.structure.kernels_labels import add_paths
+from pano_mvs.algorithms.structure.labels import plane_labels
 from pano_mvs.algorithms.structure.laid import OtherView
 from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.matched import mismatch
-from pano_mvs.algorithms.structure.view import plane_ranges
+from pano_mvs.algorithms.structure.view import grid_rows, on_grid, plane_ranges
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
@@ -37,6 +38,7 @@ OFFSETS = np.array([-3.0, -1.4, -2.5, -3.0, -1.4, -2.5, BEAM_Y])
 PLANES = Structure(NORMALS, OFFSETS, np.full(7, 0.003), np.zeros(7, np.int32))
 
 
+@pytest.mark.kernel("structure.kernels_labels")
 @pytest.mark.parametrize("step", [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])
 def test_paths_have_the_least_costs(step: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
@@ -79,22 +81,56 @@ def test_a_beam_is_told_from_the_ceiling_by_its_edges() -> None:
     assert np.mean(error[ceiling] < 0.01) > 0.9
 
 
-def test_pictures_match_best_where_surfaces_are() -> None:
-    views = [render(replace(ROOM, textures=("strong", "strong")), pose, SIZE, supersample=1) for pose in POSES]
-    rays = ray_grid(SIZE)
-    sources = [OtherView(as_map(views[at][1], TRUSTED), POSES[at], views[at][0]) for at in (1, 2)]
-    shifted = [plane_ranges(rays, POSES[0].center, normal=NORMALS[1], offset=offset) for offset in (-1.4, -1.25, -1.55)]
-    here = np.abs(views[0][1] / shifted[0] - 1) < 1e-3
-    own = np.where(here, shifted[1], views[0][1]).astype(np.float32)
-    found = mismatch(
-        own,
-        None,
-        views[0][0],
-        cam_from_world=POSES[0],
-        on_planes=shifted,
-        plane_normals_in_world=np.tile(NORMALS[1], (3, 1)),
-        sources=sources,
+@pytest.mark.parametrize("edge", [20, 0])
+def test_labels_change_where_colours_do(edge: int) -> None:
+    """Two plain areas, one of them across the seam: each shows its plane only in a few of its columns."""
+    size = (32, 64)
+    first = (np.arange(64) - edge) % 64 < 30
+    guide = np.full((*size, 3), 120, np.uint8)
+    guide[:, first] = 140
+    ranges = np.full(size, np.nan, np.float32)
+    for area, near in ((first, 2.0), (~first, 3.0)):
+        ranges[:, np.flatnonzero(area)[::9]] = near
+    labels = plane_labels(
+        [np.full(size, 2.0), np.full(size, 3.0)],
+        ranges,
+        np.where(np.isnan(ranges), 0, TRUSTED).astype(np.uint8),
+        outlined=None,
+        matched=None,
+        textured=np.isfinite(ranges),
+        tolerance=np.full(size, 0.08),
+        guide=guide,
     )
-    best = found.on_planes[0][here]
+    np.testing.assert_array_equal(labels, np.broadcast_to(~first, size))
+
+
+@pytest.mark.parametrize("rows", [256, 1000])
+def test_pictures_match_best_where_surfaces_are(rows: int) -> None:
+    """Panoramas of 1000 rows are matched at 666, whose pixels are not those of the grid; ranges are exact at both."""
+    size = rows, 2 * rows
+    views = [render(replace(ROOM, textures=("strong", "strong")), pose, size, supersample=1) for pose in POSES]
+    sources = [OtherView(as_map(views[at][1], TRUSTED), POSES[at], views[at][0]) for at in (1, 2)]
+    offsets = np.array([-1.4, -1.25, -1.55])
+    shifted = Structure(np.tile(NORMALS[1], (3, 1)), offsets, np.full(3, 0.003), np.zeros(3, np.int32))
+    rays = ray_grid(size)
+    ceiling, nearer = (plane_ranges(rays, POSES[0].center, normal=NORMALS[1], offset=offset) for offset in offsets[:2])
+    here = np.abs(views[0][1] / ceiling - 1) < 1e-3
+    own = as_map(np.where(here, nearer, views[0][1]), TRUSTED)
+    found = mismatch(own, views[0][0], shifted, planes=np.arange(3), cam_from_world=POSES[0], sources=sources)
+    assert found is not None
+    on_ceiling = on_grid(here, grid_rows(rows))
+    best = found.on_planes[0][on_ceiling]
     for other in (*found.on_planes[1:], found.own):
-        assert np.mean(best < other[here] - 0.1) > 0.8
+        assert np.mean(best < other[on_ceiling] - 0.1) > 0.8
+    normals = np.broadcast_to(NORMALS[1].astype(np.float16), (*size, 3))
+    truth = replace(as_map(views[0][1], TRUSTED), normals_in_cam=normals)
+    exact = mismatch(truth, views[0][0], shifted, planes=np.arange(3), cam_from_world=POSES[0], sources=sources)
+    assert exact is not None
+    assert np.median(np.abs(exact.own[on_ceiling] - best)) < 0.1
+
+
+def test_views_from_the_same_place_are_no_evidence() -> None:
+    view = render(ROOM, POSES[0], SIZE, supersample=1)
+    same = OtherView(as_map(view[1], TRUSTED), POSES[0], view[0])
+    own, planes = as_map(view[1], TRUSTED), np.arange(len(PLANES))
+    assert mismatch(own, view[0], PLANES, planes=planes, cam_from_world=POSES[0], sources=[same]) is None

@@ -140,7 +140,8 @@ def test_walls_without_any_match_stand_where_their_creases_are(turn_deg: float, 
     assert np.mean(error < 0.03) > 0.95
     assert (result.confidence[wall] < 128).all()
     confirmed = replace(box.maps["0.png"], confidence=np.full(wall.shape, TRUSTED, np.uint8))
-    alone = wall & (np.arange(256)[:, None] >= 128)  # the height of the ceiling is that of all views
+    # A ceiling that creases of all views have placed may take wrong ranges near it along.
+    alone = wall if ceiling_known else wall & (np.arange(256)[:, None] >= 128)
     np.testing.assert_array_equal(box.laid(structure, range_map=confirmed).range[alone], confirmed.range[alone])
 
 

@@ -265,8 +265,8 @@ def test_the_model_of_laid_planes_is_that_of_the_stored_pixels() -> None:
 def test_planes_are_laid_where_they_are_better_in_places_that_were_left_out() -> None:
     pixels = laid.read()
     kept = laid.left_out(pixels)
-    assert kept[pixels.better].mean() > 0.95
-    assert kept[~pixels.better].mean() < 0.65
+    assert kept[pixels.better].mean() > 0.9
+    assert kept[~pixels.better].mean() < 0.55
 
 
 def test_a_halved_plane_is_the_plane_and_edges_do_not_mix() -> None:

@@ -103,8 +103,8 @@ def exchange_ranges(
     match = WindowMatcher(
         reference,
         [source.picture for source in sources],
-        [source.from_reference for source in sources],
-        [source.mask for source in sources],
+        from_reference=[source.from_reference for source in sources],
+        masks=[source.mask for source in sources],
     )
     offered, scored = [], []
     for source in sources:

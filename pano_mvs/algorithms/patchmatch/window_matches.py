@@ -60,6 +60,7 @@ class WindowMatcher:
         self,
         reference: Picture,
         sources: Sequence[Picture],
+        *,
         from_reference: Sequence[Rigid3],
         masks: Sequence[Mask | None],
     ) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.structure.labels import plane_labels
+from pano_mvs.algorithms.structure.labels import plane_labels, share_of_enough
 from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.laid_coefficients import FITTED
 from pano_mvs.algorithms.structure.matched import mismatch
@@ -31,9 +31,9 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 
-MIN_PROBABILITY = 0.5
-"""A plane is laid from this probability on. In three captures and two drawn rooms, .35 to .65 gave the same shares of
-walls, floors and ceilings, and .5 and more .2 dB more of all pixels; walls without any match need .5 or less."""
+LEAST_PROBABILITIES = 0.1, 0.5
+"""A plane is laid from the first probability on where views confirm nothing, and from the second one where they confirm
+half of the sphere and more: there, own ranges that are not confirmed are right more often (`share_of_enough`)."""
 
 MAX_LAID_SOURCES = 4
 """More sources than this are not compared with planes."""
@@ -90,7 +90,8 @@ def lay_structure(
     size, planes, textured, tolerance = guide.shape[:2], found.planes, found.textured, found.tolerance
     other = found.off.copy()
     evidence = {name: values[found.off] for name, values in found.evidence.items()}
-    other[found.off] = FITTED.probabilities(evidence) < MIN_PROBABILITY
+    least = np.interp(share_of_enough(range_map.confidence), (0.0, 1.0), LEAST_PROBABILITIES)
+    other[found.off] = FITTED.probabilities(evidence) < least
     coarse = np.where(other, np.int16(-1), found.label)
     window = window_labels(found.view, coarse, found.known)
     label = _enlarged(np.where(window >= 0, window, coarse), size)
@@ -200,17 +201,8 @@ def proposed_planes(
     ]
     view = plane_view(range_map, lambda: guide, cam_from_world)
     room = room_of(view, known)
-    matched = None
-    if sources and coarse_planes:
-        matched = mismatch(
-            range_map.range,
-            range_map.normals_in_cam,
-            guide,
-            cam_from_world=cam_from_world,
-            on_planes=coarse_planes,
-            plane_normals_in_world=structure.normals_in_world[planes],
-            sources=sources[:MAX_LAID_SOURCES],
-        )
+    used = sources[:MAX_LAID_SOURCES]
+    matched = mismatch(range_map, guide, structure, planes=planes, cam_from_world=cam_from_world, sources=used)
     label = plane_labels(
         coarse_planes,
         on_grid(range_map.range, rows),
@@ -230,7 +222,7 @@ def proposed_planes(
         label[on_grid(sunk, rows)] = floor
     laid = _chosen(coarse_planes.__getitem__, label)
     places = cam_from_world.center + coarse_rays * laid[..., None]
-    views = [seen_by(view, places) for view in sources[:MAX_LAID_SOURCES]]
+    views = [seen_by(view, places) for view in used]
     agree = np.zeros(laid.shape, np.bool_)
     for seen in views:
         with np.errstate(invalid="ignore"):
@@ -240,7 +232,7 @@ def proposed_planes(
     with np.errstate(invalid="ignore"):
         off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, rows)) & ~on_grid(sunk, rows)
     own_places = cam_from_world.center + coarse_rays * own[..., None]
-    at_own = [seen_by(view, own_places) for view in sources[:MAX_LAID_SOURCES]]
+    at_own = [seen_by(view, own_places) for view in used]
     evidence = laid_evidence(own, laid, picture=colors, views=views, at_own=at_own, error=plain_error)
     return Proposal(
         view, planes, known, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, off, evidence

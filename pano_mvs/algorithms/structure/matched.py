@@ -13,16 +13,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.window_matches import Offers, WindowMatcher
+from pano_mvs.algorithms.patchmatch.window_matches import Offers, WindowMatcher, rays_of
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.laid import OtherView
-from pano_mvs.algorithms.structure.view import on_grid
-from pano_mvs.core.arrays import FloatArray, Mask, Picture
+from pano_mvs.algorithms.structure.view import grid_rows, on_grid, plane_ranges
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.surfaces import Structure
 
 # Correlations above this one say no more: the pictures are noisy, and sampled.
 _LARGEST_CORRELATION = 0.99
 # A pixel is not matched on a plane whose range differs from its own by more than this logarithm.
 _FARTHEST = 0.5
+# Other views must be farther away than this share of the median range: nearer ones match on every plane.
+_LEAST_BASELINE = 0.01
 # Share of a reduced pixel that must not be masked.
 _SHOWN = 0.999
 
@@ -43,48 +48,60 @@ class Mismatch:
 
 
 def mismatch(
-    ranges: NDArray[np.float32],
-    normals_in_cam: NDArray[np.float16] | None,
+    range_map: RangeMap,
     picture: Picture,
+    structure: Structure,
     *,
+    planes: NDArray[np.intp],
     cam_from_world: Rigid3,
-    on_planes: Sequence[FloatArray],
-    plane_normals_in_world: FloatArray,
     sources: Sequence[OtherView],
-) -> Mismatch:
-    """Return how well pictures match on planes; windows are nine pixels wide, of pictures twice as fine as the grid.
+) -> Mismatch | None:
+    """Return how well pictures match on planes; None if there is no plane, or no other view from another place.
+
+    Windows are nine pixels wide, of pictures twice as fine as the grid, or of the pictures themselves if these have
+    less than 512 rows.
 
     Args:
-        ranges: (H, W) of the view.
-        normals_in_cam: (H, W, 3) of these, or None.
+        range_map: (H, W) of the view.
         picture: (H, W, 3) RGB.
+        structure: planes in the world.
+        planes: (P,) positions of those that are tried.
         cam_from_world: pose of the view.
-        on_planes: (h, w) range of each pixel of the grid on each plane, NaN where it does not meet it.
-        plane_normals_in_world: (P, 3).
-        sources: one or more other views.
+        sources: other views.
     """
-    rows = on_planes[0].shape[0]
+    seen = range_map.range[range_map.valid]
+    least = _LEAST_BASELINE * float(np.median(seen)) if seen.size else 0.0
+    apart = [np.linalg.norm(source.cam_from_world.center - cam_from_world.center) > least for source in sources]
+    used = [source for source, is_apart in zip(sources, apart, strict=True) if is_apart]
+    if not used or not len(planes):
+        return None
+    rows = grid_rows(picture.shape[0])
     scale = max(1, min(2, picture.shape[0] // rows))
     size = scale * rows, 2 * scale * rows
     matcher = WindowMatcher(
         _reduced(picture, size),
-        [_reduced(source.picture, size) for source in sources],
-        [source.cam_from_world @ cam_from_world.inverse() for source in sources],
-        [None if source.valid is None else _reduced_mask(source.valid, size) for source in sources],
+        [_reduced(source.picture, size) for source in used],
+        from_reference=[source.cam_from_world @ cam_from_world.inverse() for source in used],
+        masks=[None if source.valid is None else _reduced_mask(source.valid, size) for source in used],
     )
     pixels = on_grid(np.arange(size[0] * size[1]).reshape(size), rows)
-    own = on_grid(ranges, rows)
+    # Of larger panoramas, pixels of the grid and of the reduced picture are not at the same places.
+    rays = rays_of(pixels.ravel(), size).reshape(*pixels.shape, 3)
+    there = pixels_containing(rays, range_map.range.shape)
+    own = range_map.range[there]
     known = np.isfinite(own)
-    own_normals = None if normals_in_cam is None else on_grid(normals_in_cam, rows)[known]
-    values = np.zeros((len(on_planes) + 1, *own.shape), np.float32)
+    normals_in_cam = range_map.normals_in_cam
+    own_normals = None if normals_in_cam is None else normals_in_cam[there][known]
+    values = np.zeros((len(planes) + 1, *own.shape), np.float32)
     values[0][known] = _lack(matcher.correlation(Offers(pixels[known], own[known], own_normals)))
-    normals = (plane_normals_in_world @ cam_from_world.rotation.T).astype(np.float16)
-    for value, plane, normal in zip(values[1:], on_planes, normals, strict=True):
+    rays_in_world = rays @ cam_from_world.rotation
+    for value, idx in zip(values[1:], planes, strict=True):
+        normal = structure.normals_in_world[idx]
+        plane = plane_ranges(rays_in_world, cam_from_world.center, normal=normal, offset=float(structure.offsets[idx]))
         with np.errstate(invalid="ignore", divide="ignore"):
             tried = np.isfinite(plane) & ~(np.abs(np.log(own / plane)) > _FARTHEST)
-        count = int(np.count_nonzero(tried))
-        offers = Offers(pixels[tried], plane[tried].astype(np.float32), np.broadcast_to(normal, (count, 3)))
-        value[tried] = _lack(matcher.correlation(offers))
+        in_cam = np.broadcast_to((cam_from_world.rotation @ normal).astype(np.float16), (int(tried.sum()), 3))
+        value[tried] = _lack(matcher.correlation(Offers(pixels[tried], plane[tried].astype(np.float32), in_cam)))
     return Mismatch(values[1:], values[0])
 
 

@@ -79,7 +79,7 @@ def left_out(pixels: Pixels) -> NDArray[np.bool_]:
     laid = np.zeros(len(pixels.better), np.bool_)
     for place in np.unique(pixels.place):
         mine = pixels.place == place
-        laid[mine] = fit(pixels[~mine]).probabilities(pixels[mine].columns) >= lay.MIN_PROBABILITY
+        laid[mine] = fit(pixels[~mine]).probabilities(pixels[mine].columns) >= lay.LEAST_PROBABILITIES[1]
     return laid
 
 

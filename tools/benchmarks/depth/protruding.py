@@ -1,7 +1,8 @@
 """What stands a little before plain walls and ceilings: beams, cables, lamps, shelves, frames, in rendered rooms.
 
 Rooms are drawn by a number: their size, what they have, and cameras around the middle, almost level and turned
-arbitrarily. The dense stages of a workflow are run with the true poses. Before `depth.structure` and after it:
+arbitrarily. The dense stages of a workflow are run with the true poses. After each of the last two, in `quality` before
+`depth.structure` and after it:
 
 * protruding: of the solid angle where something stands .5 to 20 % before the floor, the ceiling or a wall, the share
   within 1 % of the truth;
