@@ -60,7 +60,7 @@ def find_storeys(heights: FloatArray, normal_heights: FloatArray, camera_heights
     below = -np.inf
     while len(order):
         lowest = float(camera_heights[order[0]])
-        found = _levels(facing_up[(facing_up > below) & (facing_up < lowest)], step)
+        found = levels(facing_up[(facing_up > below) & (facing_up < lowest)], step)
         floor = found[0] if found else max(low, below) if low < lowest else lowest - (high - low) / 2
         limit = floor + _SAME_STOREY * (lowest - floor)
         here = order[camera_heights[order] <= limit]
@@ -88,12 +88,12 @@ def _with_ceiling(
     floor, has_floor, cameras = floors[number]
     middle = float(np.median(camera_heights[cameras]))
     limit = floors[number + 1][0] if number + 1 < len(floors) else np.inf
-    found = _levels(facing_down[(facing_down > middle) & (facing_down < limit)], step)
+    found = levels(facing_down[(facing_down > middle) & (facing_down < limit)], step)
     ceiling = found[-1] if found else min(limit, floor + _SAME_STOREY * (middle - floor), max(top, middle))
     return Storey(floor, float(ceiling), tuple(cameras), has_floor, bool(found))
 
 
-def _levels(heights: FloatArray, step: float) -> list[float]:
+def levels(heights: FloatArray, step: float) -> list[float]:
     """Return the heights of large level surfaces, in rising order."""
     if len(heights) < 50:
         return []
@@ -141,29 +141,32 @@ class Extent:
 
 
 class Orthophoto:
-    """The highest point below a cut in each pixel of one storey.
+    """The highest point below a cut in each pixel of one storey, or the lowest one above it.
 
     The result does not depend on the order of the points. Memory: 8 bytes a pixel.
     """
 
-    def __init__(self, storey: Storey, extent: Extent, *, cut: float) -> None:
+    def __init__(self, storey: Storey, extent: Extent, *, cut: float, from_below: bool = False) -> None:
         """Start with an empty picture.
 
         Args:
-            storey: whose floor bounds the points.
+            storey: whose floor and ceiling bound the points.
             extent: of the picture.
-            cut: height of the cut; points above are left out.
+            cut: height of the cut; points above are left out, or from below, those below.
+            from_below: show the lowest points above the cut, as a mirror on the floor does: x and y stay.
         """
         self.extent = extent
-        self._low = storey.floor - 0.05 * storey.height
+        self._far = storey.ceiling + 0.05 * storey.height if from_below else storey.floor - 0.05 * storey.height
         self._cut = cut
         self._photo = np.zeros(extent.size_hw[0] * extent.size_hw[1], np.int64)
 
     def add(self, points: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
         """Add points (N, 3) with z up and their colours (N, 3)."""
         index, inside = self.extent.cells(points[:, :2])
-        inside &= (points[:, 2] >= self._low) & (points[:, 2] <= self._cut)
-        share = (points[inside, 2] - self._low) / max(self._cut - self._low, 1e-12)
+        depth = abs(self._cut - self._far)
+        nearness = np.abs(points[:, 2] - self._far)
+        inside &= (nearness <= depth) & (np.abs(points[:, 2] - self._cut) <= depth)
+        share = nearness[inside] / max(depth, 1e-12)
         level = 1 + (share * ((1 << 20) - 2)).astype(np.int64)
         red, green, blue = colors_rgb[inside].astype(np.int64).T
         np.maximum.at(self._photo, index[inside], (level << 24) | (red << 16) | (green << 8) | blue)

@@ -39,7 +39,8 @@ class PlanView:
     `center`: (3,). `cam_from_plan`: (3, 3). `free`: (h, w) ranges up to which nothing is in the way, NaN where unknown.
     `seen`: (h, w) ranges that were seen, not filled, or of panes, infinite in the sky, NaN elsewhere. `errors`: (h, w)
     their relative standard deviations. `panes`: (h, w) whether they are those of windows. `points`: (N, 3) places on
-    surfaces. `normals`: (N, 3) of the surfaces, NaN where unknown.
+    surfaces. `normals`: (N, 3) of the surfaces, NaN where unknown. `point_errors`: (N,) relative standard deviations of
+    the ranges of the places, NaN where unknown.
     """
 
     center: FloatArray
@@ -50,6 +51,7 @@ class PlanView:
     panes: NDArray[np.bool_]
     points: FloatArray
     normals: FloatArray
+    point_errors: FloatArray
 
     def pixels_of(self, places: FloatArray) -> tuple[FloatArray, tuple[NDArray[np.intp], NDArray[np.intp]]]:
         """Return the distances of places (..., 3), and the rows and columns where they are seen, (...,) each."""
@@ -90,6 +92,7 @@ def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
         panes,
         cam_from_plan.inverse().apply(rays[known] * ranges[known][:, None]),
         normals[known] @ cam_from_plan.rotation,
+        error[known] if range_map.uncertainty is not None else np.full(int(known.sum()), np.nan),
     )
 
 
@@ -125,7 +128,8 @@ class CloudViews:
         known = seen[np.isfinite(ranges)]
         cam, exact = self._cams[number], np.zeros_like(ranges)
         panes = np.zeros(ranges.shape, np.bool_)
-        return PlanView(cam.center, cam.rotation, ranges, ranges, exact, panes, known[:, :3], known[:, 3:6])
+        places, normals, unknown = known[:, :3], known[:, 3:6], np.full(len(known), np.nan)
+        return PlanView(cam.center, cam.rotation, ranges, ranges, exact, panes, places, normals, unknown)
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,13 @@ class Room:
     area: float
     label_xy: FloatArray
 
+    def contains(self, xy: FloatArray) -> NDArray[np.bool_]:
+        """Return which positions (N, 2) are in the room."""
+        inside = contains(self.outline, xy)
+        for hole in self.holes:
+            inside &= ~contains(hole, xy)
+        return inside
+
 
 def find_rooms(
     evidence: Evidence, lines: Sequence[Line], *, cells: WallCells, cameras: FloatArray

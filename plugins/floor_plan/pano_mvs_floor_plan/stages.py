@@ -21,6 +21,7 @@ from pano_mvs.api import (
     PointCloud,
     Poses,
     RangeMap,
+    WorldAxes,
     chunks,
     split_groups,
     stage,
@@ -42,12 +43,16 @@ from pano_mvs_floor_plan.plan_drawings import (
     world_file_text,
     write_dxf,
 )
+from pano_mvs_floor_plan.room_table import write_rooms_csv
+from pano_mvs_floor_plan.rooms import Room
+from pano_mvs_floor_plan.sheets import SheetSettings, StoreySheet, write_sheets
 from pano_mvs_floor_plan.wall_lines import Line
 from pano_mvs_floor_plan.walls_and_openings import plan_storey
 
 Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 
 _EDGE_QUANTILE = 0.01
+_CEILING_CUT = 0.8  # of the storey's height, above which the plan of the ceiling shows it
 _MARGIN = 0.03
 _MAX_SIDE_PX = 4096
 
@@ -68,6 +73,19 @@ class FloorPlanParams(Params):
         gt=0,
         le=1,
         description="share of the height of the room that a wall must show, over 15 % of it along",
+    )
+    sheets: tuple[Literal["pdf", "svg", "png"], ...] = Field(
+        default=("pdf",), description="sheets at a scale, with the sizes of rooms and the plan of the ceiling"
+    )
+    paper: Literal["a4", "a3", "a2", "a1", "a0", "letter", "tabloid"] = Field(
+        default="a4", description="paper of the sheets"
+    )
+    scale: int = Field(
+        default=0, ge=0, le=100_000, description="denominator of the scale of sheets; 0: the largest scale that fits"
+    )
+    title: str = Field(default="Floor plan", max_length=52, description="title of the sheets")
+    room_names: dict[str, str] = Field(
+        default_factory=dict, description="names of rooms, by the name of an image that was taken in each"
     )
     min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
 
@@ -98,6 +116,8 @@ def floor_plan(
     ctx: Context,
 ) -> Files:
     """Write plans of all storeys: floor_plan/storey_0.png with .pgw, storey_0.svg …, and floor_plan.json about them.
+
+    sheets.pdf shows them at a scale, with sizes of rooms and plans of the ceilings; rooms.csv is a table of the rooms.
 
     Rooms are those in which a camera stands; their outlines are closed, and lie on lines of walls. The PNG shows the
     floor from above, cut below the cameras, with the walls, doors and windows, cameras and a scale bar. The coordinates
@@ -163,7 +183,12 @@ class _GroupPlan:
         points, normals = (np.concatenate(parts) for parts in zip(*sampled, strict=True))
         storeys = find_storeys(points[:, 2], normals[:, 2], self.centers[:, 2])
         extent = self._extent([points[:, :2] for points, _ in sampled if len(points)])
-        entries = [self._storey(number, storey, extent) for number, storey in enumerate(storeys)]
+        entries, sheets = [], []
+        for number, storey in enumerate(storeys):
+            entry, sheet = self._storey(number, storey, extent)
+            entries.append(entry)
+            sheets.append(sheet)
+        self._write_sheets(entries, sheets)
         if not storeys:
             self.notes.append("no floor plan: no view has confirmed ranges of surfaces")
         if not all(storey.has_floor for storey in storeys):
@@ -182,7 +207,7 @@ class _GroupPlan:
         if ranges:
             nothing, nowhere = np.full((1, 2), np.nan), np.zeros((0, 3))
             unseen = np.zeros((1, 2), np.bool_)
-            empty = PlanView(np.zeros(3), np.eye(3), nothing, nothing, nothing, unseen, nowhere, nowhere)
+            empty = PlanView(np.zeros(3), np.eye(3), nothing, nothing, nothing, unseen, nowhere, nowhere, np.zeros(0))
             names = self.poses.names
             return lambda idx: range_view(ranges[names[idx]], cams[idx]) if names[idx] in ranges else empty
         views = CloudViews(cams)
@@ -212,13 +237,33 @@ class _GroupPlan:
         columns, rows = np.maximum(1, np.ceil((high - low) / pixel)).astype(int).tolist()
         return Extent(float(low[0]), float(high[1]), pixel, (rows, columns))
 
-    def _storey(self, number: int, storey: Storey, extent: Extent) -> dict[str, Any]:
-        """Write the files of one storey, and return its entry in floor_plan.json."""
+    def _write_sheets(self, entries: Sequence[dict[str, Any]], sheets: Sequence[StoreySheet]) -> None:
+        """Write the sheets and the table of rooms of all storeys, and enter their names."""
+        write_rooms_csv(self.folder / "rooms.csv", sheets, is_metric=self.poses.metric)
+        if not self.params.sheets:
+            return
+        settings = SheetSettings(
+            self.params.title,
+            self.poses.metric,
+            self.poses.scale,
+            has_north=self.poses.axes is WorldAxes.NORTH,
+            paper=self.params.paper,
+            scale=self.params.scale,
+        )
+        files, notes = write_sheets(self.folder, sheets, settings, self.params.sheets)
+        self.notes += notes
+        for entry, sheet in zip(entries, sheets, strict=True):
+            entry |= files.get(sheet.name, {})
+
+    def _storey(self, number: int, storey: Storey, extent: Extent) -> tuple[dict[str, Any], StoreySheet]:
+        """Write the drawings of one storey, and return its entry in floor_plan.json, and what its sheets show."""
         heights = self.centers[list(storey.cameras), 2]
         eyes = float(np.median(heights)) if len(heights) else storey.ceiling
         photo = Orthophoto(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor))
+        above = Orthophoto(storey, extent, cut=storey.floor + _CEILING_CUT * storey.height, from_below=True)
         for points, _, colors in self._chunks():
             photo.add(points, colors)
+            above.add(points, colors)
         side = extent.pixel * max(extent.size_hw)
         evidence = Evidence(storey, extent.with_pixel(max(storey.height / 80, side / 1500)))
         for idx in storey.cameras:
@@ -251,6 +296,8 @@ class _GroupPlan:
             self.poses.metric,
         )
         files = self._write_files(f"storey_{number}", photo, drawing)
+        room_names = [self._room_name(idx, room, names) for idx, room in enumerate(plan.rooms)]
+        sheet = StoreySheet(f"storey_{number}", f"storey {number}", plan, room_names, cameras, *above.picture(), extent)
         return {
             **files,
             "z_range": [storey.floor, storey.ceiling],
@@ -263,19 +310,43 @@ class _GroupPlan:
             "plan_size_px": [extent.size_hw[1], extent.size_hw[0]],
             "rooms": [
                 {
+                    "name": name,
                     "outline": room.outline.tolist(),
                     "holes": [hole.tolist() for hole in room.holes],
                     "area": room.area,
-                    "lengths": np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1).tolist(),
+                    "area_std": _known(size.area.std),
+                    "lengths": [side.value for side in size.sides],
+                    "length_stds": [_known(side.std) for side in size.sides],
+                    "size": [size.length.value, size.width.value],
+                    "size_stds": [_known(size.length.std), _known(size.width.std)],
+                    "is_rectangle": size.is_rectangle,
+                    "height": _known(size.height.value),
+                    "height_std": _known(size.height.std),
                 }
-                for room in plan.rooms
+                for room, size, name in zip(plan.rooms, plan.sizes, room_names, strict=True)
             ],
             "walls": [
                 {"ends": wall.ends.tolist(), "room": wall.room, "thickness": wall.thickness} for wall in plan.walls
             ],
-            "openings": [{"kind": opening.kind, "ends": opening.ends.tolist()} for opening in plan.openings],
+            "openings": [
+                {
+                    "kind": opening.kind,
+                    "ends": opening.ends.tolist(),
+                    "width": opening.width,
+                    "rooms": list(opening.rooms),
+                    "leaf": opening.leaf and {name: xy.tolist() for name, xy in vars(opening.leaf).items()},
+                }
+                for opening in plan.openings
+            ],
             "cameras": {name: list(place) for name, place in names.items()},
-        }
+        }, sheet
+
+    def _room_name(self, number: int, room: Room, cameras: Mapping[str, tuple[float, float]]) -> str:
+        """Return the name that the settings give a room by a panorama in it, or else its number."""
+        for image, name in self.params.room_names.items():
+            if image in cameras and room.contains(np.array([cameras[image]]))[0]:
+                return name
+        return f"Room {number + 1}"
 
     def _write_files(self, stem: str, photo: Orthophoto, drawing: PlanDrawing) -> dict[str, str]:
         """Write the files of a storey in all formats, and return their names."""
@@ -293,6 +364,10 @@ class _GroupPlan:
             files["dxf"] = f"{stem}.dxf"
             write_dxf(self.folder / files["dxf"], drawing)
         return files
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 def _lines(planes: Structure | None, group: int, turn: FloatArray) -> list[Line]:

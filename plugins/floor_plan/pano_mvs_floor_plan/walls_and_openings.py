@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs_floor_plan.door_leaves import DoorLeaf, door_leaves
 from pano_mvs_floor_plan.evidence import LAYERS, SURE, Evidence, PlanView
 from pano_mvs_floor_plan.rooms import Room, Side, find_rooms
+from pano_mvs_floor_plan.sizes import RoomSize, SizeEvidence
 from pano_mvs_floor_plan.wall_lines import Line, wall_lines
 
 Span = tuple[float, float, bool]  # start and end along a side, and whether it is open down to the floor
@@ -29,10 +32,22 @@ class Wall:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """An opening in a wall: its ends (2, 2), in the middle of the wall if both sides were seen."""
+    """An opening in a wall: its ends (2, 2), in the middle of the wall if both sides were seen.
+
+    `rooms`: those that it leads to. `thickness`: of the wall, None if unknown. `leaf`: of a door that stands open, None
+    if none was seen.
+    """
 
     ends: FloatArray
     kind: Literal["door", "window"]
+    rooms: tuple[int, ...]
+    thickness: float | None
+    leaf: DoorLeaf | None = None
+
+    @property
+    def width(self) -> float:
+        """The clear width."""
+        return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +55,14 @@ class StoreyPlan:
     """What is drawn of a storey; `solids` are the outlines (4, 2) of walls of which both sides were seen."""
 
     rooms: list[Room]
+    sizes: list[RoomSize]
     walls: list[Wall]
     openings: list[Opening]
     solids: list[FloatArray]
+
+    def opening_counts(self, room: int) -> Counter[str]:
+        """Return how many doors and windows a room has."""
+        return Counter(opening.kind for opening in self.openings if room in opening.rooms)
 
 
 def plan_storey(
@@ -56,7 +76,8 @@ def plan_storey(
     """Return the plan of a storey.
 
     `evidence`: what the views show. `known`: lines of known planes. `views`: gives the views of the evidence, and is
-    called twice. `cameras`: (N, 2) their positions. `min_share`: share of the height at which a wall must be seen.
+    called three times. `cameras`: (N, 2) their positions. `min_share`: share of the height at which a wall must be
+    seen.
     """
     evidence.recount(views())
     cells = evidence.wall_cells()
@@ -65,7 +86,9 @@ def plan_storey(
     rooms, sides = find_rooms(evidence, lines, cells=cells, cameras=cameras)
     frames = [_Frame(side, evidence) for side in sides]
     thickest, least = 0.2 * evidence.storey.height, evidence.extent.pixel
+    measured = SizeEvidence(lines, rooms, cell=evidence.extent.pixel)
     for view in views():
+        measured.add(view)
         for frame in frames:
             frame.add(view)
     hidden = [
@@ -81,7 +104,11 @@ def plan_storey(
             depth = _depth_at((start + end) / 2, hidden[idx])
             ends = frame.xy_of(start, end) + frame.back * depth / 2
             if not any(np.linalg.norm((one.ends - ends).mean(axis=0)) < thickest / 2 for one in openings):
-                openings.append(Opening(ends, "door" if low else "window"))
+                beyond = {
+                    frames[other].side.room for other, first, last, _ in hidden[idx] if first < end and start < last
+                }
+                rooms_beside = tuple(sorted({frame.side.room, *beyond}))
+                openings.append(Opening(ends, "door" if low else "window", rooms_beside, depth or None))
         edges = [0.0, *(edge for start, end, _ in spans for edge in (start, end)), frame.length]
         for start, end in zip(edges[::2], edges[1::2], strict=True):
             if end - start < least or frame.side.line >= len(lines):  # the edge of the extent
@@ -97,7 +124,12 @@ def plan_storey(
                 side = frame.xy_of(first - before, last + after)
                 solids.append(np.concatenate([side, side[::-1] + frame.back * depth]))
             walls.append(Wall(frame.xy_of(start, end), frame.side.room, pieces[0][2] if pieces else None))
-    return StoreyPlan(rooms, walls, openings, solids)
+    doors = [(one.ends, one.thickness or 0.0) for one in openings if one.kind == "door"]
+    leaves = iter(
+        door_leaves(doors, views(), lines=lines, storey=evidence.storey, cell=evidence.extent.pixel) if doors else ()
+    )
+    openings = [replace(one, leaf=next(leaves)) if one.kind == "door" else one for one in openings]
+    return StoreyPlan(rooms, measured.sizes(sides, storey=evidence.storey), walls, openings, solids)
 
 
 def _depth_at(place: float, hidden: Sequence[tuple[int, float, float, float]]) -> float:

@@ -39,7 +39,7 @@ def planned(
     folder.mkdir(exist_ok=True)
     ctx = Context(np.random.default_rng(0), folder)
     return floor_plan(
-        cloud, poses, ranges, None, FloorPlanParams.model_validate({"width_px": 600} | settings), ctx
+        cloud, poses, ranges, None, FloorPlanParams.model_validate({"width_px": 600, "sheets": ()} | settings), ctx
     ), ctx
 
 
@@ -55,7 +55,8 @@ def svg_walls(files: Files, name: str = "floor_plan/storey_0.svg") -> np.ndarray
 
 def test_the_drawings_have_the_walls_of_the_room(tmp_path: Path) -> None:
     files, ctx = planned(tmp_path, the_cloud(room_cloud()), the_poses((2, 2, 1.5)), formats=("png", "svg", "dxf"))
-    names = {"floor_plan.json", "storey_0.png", "storey_0.pgw", "storey_0.svg", "storey_0.dxf"}
+    drawings = {f"storey_0.{suffix}" for suffix in ("png", "pgw", "svg", "dxf")}
+    names = {"floor_plan.json", "rooms.csv"} | drawings
     assert set(files.files) == {f"floor_plan/{name}" for name in names}
     true = walls_of(((0, 0), (6, 0), (6, 3), (3.5, 3), (3.5, 5), (0, 5)))
     walls = svg_walls(files)
@@ -149,7 +150,8 @@ def test_groups_have_a_plan_each_and_too_few_points_none(tmp_path: Path) -> None
     one = Poses.without_points(cameras, frame="", scale="", metric=True, axes=WorldAxes.LEVEL)
     both = Poses(**{**vars(one), "group_idx": np.array([0, 0, 0, 1, 1], np.int32), "other_worlds": (("b", "", False),)})
     files, ctx = planned(tmp_path, PointCloud.of_groups([large, few]), both, formats=("svg",))
-    assert set(files.files) == {"floor_plan/floor_plan.json", "floor_plan/storey_0.svg"}
+    names = {"floor_plan.json", "rooms.csv", "storey_0.svg"}
+    assert set(files.files) == {f"floor_plan/{name}" for name in names}
     assert ctx.notes == ["group 1: no floor plan: 50 points of the cloud are seen from 2 views"]
     files, _ = planned(tmp_path / "b", PointCloud.of_groups([large, large]), both, formats=("svg",))
     assert "floor_plan_1/storey_0.svg" in files.files

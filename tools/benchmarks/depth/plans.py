@@ -11,7 +11,10 @@ so that another run measures a change of the plan alone.
   of their areas;
 * doors: openings of the true plan that are drawn, within 30 cm, of all, and how many others are drawn, at no door or
   glass door within 60 cm;
-* windows: the same of windows.
+* windows: the same of windows;
+* sizes: median and 95 % of the errors of length and width of the rooms that are found, and the share within twice
+  their stated standard deviations; heights: the same of the heights of these rooms;
+* leaves: open leaves of the doors that are drawn whose free ends are drawn within 30 cm, of all, and how many others.
 
 The walls of a house are those of the rooms in which a camera stands. Those of a capture are the places where its true
 ranges show vertical surfaces at 40 % of the height of the storey; their angle is not compared.
@@ -92,6 +95,8 @@ class TrueStorey:
     rooms: list[tuple[float, float, float, float]]
     doors: list[FloatArray]  # (2, 2) ends, in the middle of the wall
     windows: list[FloatArray]
+    height: float = np.nan
+    leaf_ends: Sequence[tuple[float, float] | None] = ()  # of the doors
     parallel: bool = True
 
 
@@ -120,7 +125,10 @@ def true_storeys(name: str) -> list[TrueStorey]:
             ]
             for kind, ones in (("doors", doors), ("windows", [one for one in own if one not in doors]))
         }
-        result.append(TrueStorey(floor, Samples.of(segments), rectangles, middles["doors"], middles["windows"]))
+        height = next(room.height for room in rooms if room.floor == floor)
+        leaf_ends = [one.leaf_end for one in doors]
+        walls = Samples.of(segments)
+        result.append(TrueStorey(floor, walls, rectangles, middles["doors"], middles["windows"], height, leaf_ends))
     return result
 
 
@@ -149,11 +157,21 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
     to_true = walls.distances(true.walls, within=_NEAR, parallel=true.parallel)
     from_true = true.walls.distances(walls, within=_FOUND, parallel=true.parallel)
     outlines = [np.array(room["outline"]) for room in drawn.get("rooms", [])]
-    matched, areas = 0, []
+    areas: list[float] = []
+    sizes: list[tuple[float, float]] = []
+    heights: list[tuple[float, float]] = []
     for x0, y0, x1, y1 in true.rooms:
-        best = max((_overlap(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), one) for one in outlines), default=0)
-        matched += best > 0.9
-        areas += [abs(best - 1)] if best > 0.9 else []
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        best, number = max(((_overlap(corners, one), idx) for idx, one in enumerate(outlines)), default=(0.0, 0))
+        if best > 0.9:
+            areas.append(abs(best - 1))
+            room = drawn["rooms"][number]
+            lengths = sorted((x1 - x0, y1 - y0), reverse=True)
+            sizes += [
+                (found - true, std) for found, true, std in zip(room["size"], lengths, room["size_stds"], strict=True)
+            ]
+            if room["height"] is not None:
+                heights.append((room["height"] - true.height, room["height_std"]))
     openings = {}
     for kind, those in (("door", true.doors), ("window", true.windows)):
         # A glass door to a balcony may be drawn as either.
@@ -166,9 +184,31 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
         "found": np.isfinite(from_true),
         "errors": to_true[np.isfinite(to_true)],
         "false": ~np.isfinite(to_true),
-        "rooms": np.array([matched, len(true.rooms)]),
+        "rooms": np.array([len(areas), len(true.rooms)]),
         "areas": np.array(areas),
+        "sizes": np.array(sizes, np.float64).reshape(-1, 2),
+        "heights": np.array(heights, np.float64).reshape(-1, 2),
+        "leaves": _leaves(true, drawn),
     } | openings
+
+
+def _leaves(true: TrueStorey, drawn: dict[str, Any]) -> NDArray[np.int64]:
+    """Return how many leaves of drawn doors are drawn where they are, of how many, and how many are drawn elsewhere."""
+    found = held = wrong = 0
+    for opening in drawn.get("openings", []):
+        near = [
+            end
+            for ends, end in zip(true.doors, true.leaf_ends, strict=False)
+            if np.linalg.norm(np.mean(ends, axis=0) - np.mean(opening["ends"], axis=0)) < _NEAR
+        ]
+        leaf = opening["leaf"] and opening["leaf"]["open_end"]
+        is_right = bool(leaf) and any(
+            one is not None and np.linalg.norm(np.subtract(one, leaf)) < _NEAR for one in near
+        )
+        held += any(one is not None for one in near)
+        found += is_right
+        wrong += bool(leaf) and not is_right
+    return np.array([found, held, wrong])
 
 
 def _overlap(first: FloatArray, second: FloatArray) -> float:
@@ -229,7 +269,7 @@ def measured(capture: Capture, files: Files) -> dict[str, NDArray[Any]]:
     for missing in [one for one in true or [] if not any(one is shown for shown, _ in rows)]:
         rows.append((missing, compared(missing, Samples.of([]), {})))
     return {
-        key: np.sum(parts, axis=0) if key in ("rooms", "doors", "windows") else np.concatenate(parts)
+        key: np.sum(parts, axis=0) if key in ("rooms", "doors", "windows", "leaves") else np.concatenate(parts)
         for key in rows[0][1]
         if (parts := [row[key] for _, row in rows])
     }
@@ -247,8 +287,18 @@ def figures(found: dict[str, NDArray[Any]]) -> tuple[str, ...]:
         f"{100 * found['false'].mean():.1f} %",
         f"{rooms[0]} of {rooms[1]}",
         f"{area:.1f} %",
-        *("{} of {}, {} wrong".format(*found[kind]) for kind in ("doors", "windows")),
+        *("{} of {}, {} wrong".format(*found[kind]) for kind in ("doors", "windows", "leaves")),
+        *(_errors_text(found[kind]) for kind in ("sizes", "heights")),
     )
+
+
+def _errors_text(errors: FloatArray) -> str:
+    """Return the median and 95 % of errors with standard deviations (N, 2), and the share within two of these."""
+    if not len(errors):
+        return "–"
+    size = np.abs(errors[:, 0])
+    median, most = np.quantile(size, [0.5, 0.95]) * 100
+    return f"{median:.1f}, {most:.1f} cm, {100 * np.mean(size <= 2 * errors[:, 1]):.0f} % of {len(errors)}"
 
 
 def main() -> None:
@@ -269,4 +319,5 @@ def main() -> None:
         made = dense(chain, capture, width=given.width)
         files = planned(capture, made, settings, folder=SCRATCH / "plans" / capture.name)
         rows.append((capture.name, *figures(measured(capture, files))))
-    print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors", "windows"], rows)
+    print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors", "windows", "leaves", "sizes",
+                 "heights"], rows)  # fmt: skip

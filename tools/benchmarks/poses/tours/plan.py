@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -63,17 +63,21 @@ class Camera:
 
 @dataclass(frozen=True)
 class Room:
-    """A room of a storey: its rectangle (x0, y0, x1, y1), what it is, and its height above the ground."""
+    """A room: its rectangle (x0, y0, x1, y1), what it is, its floor's height above the ground, and its own height."""
 
     name: str
     kind: str
     rectangle: tuple[float, float, float, float]
     floor: float
+    height: float
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A door, window, balcony or opening in a wall along x (axis 0) or y, from start to end, on a floor."""
+    """A door, window, balcony or opening in a wall along x (axis 0) or y, from start to end, on a floor.
+
+    `leaf_end`: where the free end of a door's open leaf is, (x, y).
+    """
 
     axis: int
     line: float
@@ -81,6 +85,7 @@ class Opening:
     end: float
     kind: str
     floor: float
+    leaf_end: tuple[float, float] | None = None
 
 
 @dataclass
@@ -140,7 +145,7 @@ def _storey(
     """Build one storey and return its rooms, the corridor first."""
     rng, (wide, south, north), length = builder.rng, sizes, style.length
     stairs = style.storeys > 1
-    rooms = [Room(f"corridor {storey}", "corridor", (0.0, 0.0, length, wide), floor)]
+    rooms = [Room(f"corridor {storey}", "corridor", (0.0, 0.0, length, wide), floor, height)]
     kinds = ["living", "kitchen", "bath", "bedroom", "study", "bedroom", "bath", "store", "bedroom", "study"] * 3
     rng.shuffle(kinds)
     kinds.insert(0, "living" if storey == 0 else "bedroom")
@@ -157,7 +162,7 @@ def _storey(
             kind = "hall" if hall else "office" if style.equal else kinds.pop(0)
             if kind == "bath" and right - left > 3.6:
                 kind = "bedroom"
-            rooms.append(Room(f"{kind} {storey}.{len(rooms)}", kind, (left, y0, right, y1), floor))
+            rooms.append(Room(f"{kind} {storey}.{len(rooms)}", kind, (left, y0, right, y1), floor, height))
     for room in rooms:
         _shell(builder, room, height, hole=storey > 0 and room.kind == "hall", last=storey + 1 == style.storeys)
     _walls(builder, rooms, height)
@@ -274,13 +279,15 @@ def _wall(
             x, y = (along, across) if axis == 0 else (across, along)
             builder.taken.append((x[0], y[0], x[1], y[1], z))
             if kind == "door" and axis == 0:
-                _door_leaf(builder, (a, b, line, z), trim)
+                builder.openings[-1] = replace(
+                    builder.openings[-1], leaf_end=_door_leaf(builder, (a, b, line, z), trim)
+                )
         at = b
     add(at, end, 0.0, height, PLASTER, WHITE)
 
 
-def _door_leaf(builder: _Builder, place: tuple[float, float, float, float], color: Color) -> None:
-    """Add the open leaf of a door in a wall along x, on the side of the room."""
+def _door_leaf(builder: _Builder, place: tuple[float, float, float, float], color: Color) -> tuple[float, float]:
+    """Add the open leaf of a door in a wall along x, on the side of the room, and return its free end."""
     a, b, line, z = place
     side = -1.0 if line <= 0 else 1.0
     turn = np.radians(float(builder.rng.uniform(65, 105))) * side
@@ -289,6 +296,7 @@ def _door_leaf(builder: _Builder, place: tuple[float, float, float, float], colo
     high = z + _DOOR[1] - 0.06
     builder.box((x - half, y - 0.02, z + 0.01), (x + half, y + 0.02, high), PANELS, color,
                 turn_deg=float(np.degrees(turn)))  # fmt: skip
+    return x + half * float(np.cos(turn)), y + half * float(np.sin(turn))
 
 
 def _stairs(builder: _Builder, hall: Room, rise: float) -> None:
