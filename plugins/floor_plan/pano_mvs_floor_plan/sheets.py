@@ -62,6 +62,8 @@ class StoreySheet:
     Attributes:
         name: of its files.
         title: of the storey.
+        floor: its height.
+        height: of the ceiling above it.
         plan: in its coordinates, x right and y up.
         room_names: of its rooms.
         cameras: (N, 2) where panoramas were taken.
@@ -72,6 +74,8 @@ class StoreySheet:
 
     name: str
     title: str
+    floor: float
+    height: float
     plan: StoreyPlan
     room_names: Sequence[str]
     cameras: FloatArray
@@ -119,6 +123,12 @@ class _Layout:
     def on_page(self, xy: FloatArray) -> FloatArray:
         """Return positions (..., 2) of the plan on the page."""
         return np.asarray((xy - self.middle) @ self.turn.T * self.mm_per_unit + self.center)
+
+
+def page_bytes(paper: str) -> int:
+    """Return the memory for pictures of a page."""
+    long, short = PAPERS_MM[paper]
+    return round(20 * long * short * (_DPI / _INCH) ** 2)
 
 
 def write_sheets(
@@ -278,8 +288,8 @@ def _draw_photo(axes: Axes, storey: StoreySheet, layout: _Layout) -> None:
         seen = (inside > 0) & (known > 0)
         if seen.sum() > _LEAST_SEEN * inside.sum():
             shown |= seen
-    picture = np.full((height, width, 3), 255, np.uint8)
-    picture[shown] = 255 - (255 - photo[shown].astype(np.float64)) * _PHOTO_STRENGTH
+    picture = cv2.addWeighted(photo, _PHOTO_STRENGTH, np.full_like(photo, 255), 1 - _PHOTO_STRENGTH, 0)
+    picture[~shown] = 255
     box = (low[0], low[0] + width * pixel, high[1] - height * pixel, high[1])
     axes.imshow(picture, extent=box, interpolation="none", aspect="auto")
     axes.set(xlim=(0, layout.page_mm[0]), ylim=(0, layout.page_mm[1]))  # which the picture has changed

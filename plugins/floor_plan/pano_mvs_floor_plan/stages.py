@@ -33,6 +33,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import world_up, z_up_from_world
 from pano_mvs_floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
+from pano_mvs_floor_plan.ifc import IFC_REMEDY, BuildingSettings, has_ifcopenshell, write_ifc
 from pano_mvs_floor_plan.plan_drawings import (
     DXF_REMEDY,
     PlanDrawing,
@@ -45,7 +46,7 @@ from pano_mvs_floor_plan.plan_drawings import (
 )
 from pano_mvs_floor_plan.room_table import write_rooms_csv
 from pano_mvs_floor_plan.rooms import Room
-from pano_mvs_floor_plan.sheets import SheetSettings, StoreySheet, write_sheets
+from pano_mvs_floor_plan.sheets import SheetSettings, StoreySheet, page_bytes, write_sheets
 from pano_mvs_floor_plan.wall_lines import Line
 from pano_mvs_floor_plan.walls_and_openings import plan_storey
 
@@ -60,8 +61,10 @@ _MAX_SIDE_PX = 4096
 class FloorPlanParams(Params):
     """Settings of export.floor_plan."""
 
-    formats: tuple[Literal["png", "svg", "dxf"], ...] = Field(
-        default=("png", "svg"), min_length=1, description="png with world file, svg and dxf of the wall lines"
+    formats: tuple[Literal["png", "svg", "dxf", "ifc"], ...] = Field(
+        default=("png", "svg"),
+        min_length=1,
+        description="png with world file, svg and dxf of the wall lines, ifc of the building",
     )
     width_px: int = Field(
         default=1600, ge=100, le=_MAX_SIDE_PX, description="longer side of the plan in pixels, if `pixel` is 0"
@@ -94,15 +97,21 @@ class FloorPlanParams(Params):
     def _can_be_written(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if "dxf" in formats and not has_ezdxf():
             raise ValueError(DXF_REMEDY)
+        if "ifc" in formats and not has_ifcopenshell():
+            raise ValueError(IFC_REMEDY)
         return tuple(dict.fromkeys(formats))
 
 
 def plan_memory_bytes(params: FloorPlanParams, inputs: Mapping[str, Any]) -> int:
-    """Return the memory for the grids of one storey, 40 bytes a pixel, for what cameras see, and parts of the cloud."""
+    """Return the memory for the grids of one storey, for what cameras see, parts of the cloud, and pictures of pages.
+
+    A pixel takes 50 bytes; the photo of each storey's ceiling is kept, 4 bytes a pixel, for up to ten storeys.
+    """
     return (
         500_000_000
         + 500_000 * len(inputs["poses"].names)
-        + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+        + 90 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+        + (page_bytes(params.paper) if params.sheets else 0)
     )
 
 
@@ -240,17 +249,25 @@ class _GroupPlan:
     def _write_sheets(self, entries: Sequence[dict[str, Any]], sheets: Sequence[StoreySheet]) -> None:
         """Write the sheets and the table of rooms of all storeys, and enter their names."""
         write_rooms_csv(self.folder / "rooms.csv", sheets, is_metric=self.poses.metric)
+        has_north = self.poses.axes is WorldAxes.NORTH
+        if "ifc" in self.params.formats and self.poses.metric:
+            settings = BuildingSettings(
+                self.params.title, "/".join(sorted(self.poses.names)), has_north, self.poses.origin_lla
+            )
+            write_ifc(self.folder / "plan.ifc", sheets, settings)
+        elif "ifc" in self.params.formats:
+            self.notes.append("no plan.ifc: lengths of a building are in metres, and the scale is not known")
         if not self.params.sheets:
             return
-        settings = SheetSettings(
+        sheet_settings = SheetSettings(
             self.params.title,
             self.poses.metric,
             self.poses.scale,
-            has_north=self.poses.axes is WorldAxes.NORTH,
+            has_north=has_north,
             paper=self.params.paper,
             scale=self.params.scale,
         )
-        files, notes = write_sheets(self.folder, sheets, settings, self.params.sheets)
+        files, notes = write_sheets(self.folder, sheets, sheet_settings, self.params.sheets)
         self.notes += notes
         for entry, sheet in zip(entries, sheets, strict=True):
             entry |= files.get(sheet.name, {})
@@ -297,7 +314,17 @@ class _GroupPlan:
         )
         files = self._write_files(f"storey_{number}", photo, drawing)
         room_names = [self._room_name(idx, room, names) for idx, room in enumerate(plan.rooms)]
-        sheet = StoreySheet(f"storey_{number}", f"storey {number}", plan, room_names, cameras, *above.picture(), extent)
+        sheet = StoreySheet(
+            f"storey_{number}",
+            f"storey {number}",
+            storey.floor,
+            storey.height,
+            plan,
+            room_names,
+            cameras,
+            *above.picture(),
+            extent,
+        )
         return {
             **files,
             "z_range": [storey.floor, storey.ceiling],
@@ -333,6 +360,8 @@ class _GroupPlan:
                     "kind": opening.kind,
                     "ends": opening.ends.tolist(),
                     "width": opening.width,
+                    "bottom": opening.bottom,
+                    "top": opening.top,
                     "rooms": list(opening.rooms),
                     "leaf": opening.leaf and {name: xy.tolist() for name, xy in vars(opening.leaf).items()},
                 }

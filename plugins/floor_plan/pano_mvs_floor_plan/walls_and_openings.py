@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,24 @@ from pano_mvs_floor_plan.rooms import Room, Side, find_rooms
 from pano_mvs_floor_plan.sizes import RoomSize, SizeEvidence
 from pano_mvs_floor_plan.wall_lines import Line, wall_lines
 
-Span = tuple[float, float, bool]  # start and end along a side, and whether it is open down to the floor
-
+_TOUCH = 1e-6
 _ROWS = 64  # from floor to ceiling, in which a wall is looked at
+# In nine rendered houses, these two limits find most of the openings and few others: of the mean score of what is open,
+# and of how much larger it is than beside.
+_OPEN, _MORE_OPEN = 0.25, 0.6
+
+
+Behind = tuple[int, float, float, float]
+"""The number of another side behind one, from where to where along this one, and how far behind."""
+
+
+class Span(NamedTuple):
+    """Where views see through a side: from start to end along it, and from bottom to top above the floor."""
+
+    start: float
+    end: float
+    bottom: float  # 0: open down to the floor
+    top: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +49,14 @@ class Wall:
 class Opening:
     """An opening in a wall: its ends (2, 2), in the middle of the wall if both sides were seen.
 
-    `rooms`: those that it leads to. `thickness`: of the wall, None if unknown. `leaf`: of a door that stands open, None
-    if none was seen.
+    `bottom`, `top`: of what was seen through, above the floor. `rooms`: those that it leads to. `thickness`: of the
+    wall, None if unknown. `leaf`: of a door that stands open, None if none was seen.
     """
 
     ends: FloatArray
     kind: Literal["door", "window"]
+    bottom: float
+    top: float
     rooms: tuple[int, ...]
     thickness: float | None
     leaf: DoorLeaf | None = None
@@ -51,6 +68,27 @@ class Opening:
 
 
 @dataclass(frozen=True, eq=False)
+class WallBody:
+    """A piece of a wall with its openings: the ends (2, 2) of one side, with the room on the left, and its thickness.
+
+    `rooms`: the room, and the one behind if both sides were seen; otherwise the thickness is None.
+    """
+
+    ends: FloatArray
+    thickness: float | None
+    rooms: tuple[int, ...]
+
+    def holds(self, opening: Opening) -> bool:
+        """Return whether an opening is in the wall."""
+        way = self.ends[1] - self.ends[0]
+        along = way / np.linalg.norm(way)
+        middle = opening.ends.mean(axis=0) - self.ends[0]
+        depth = float(middle @ (along[1], -along[0]))
+        thickness = self.thickness or 0.0
+        return bool(-_TOUCH < depth < thickness + _TOUCH and 0 <= middle @ along <= np.linalg.norm(way))
+
+
+@dataclass(frozen=True, eq=False)
 class StoreyPlan:
     """What is drawn of a storey; `solids` are the outlines (4, 2) of walls of which both sides were seen."""
 
@@ -59,6 +97,7 @@ class StoreyPlan:
     walls: list[Wall]
     openings: list[Opening]
     solids: list[FloatArray]
+    bodies: list[WallBody]
 
     def opening_counts(self, room: int) -> Counter[str]:
         """Return how many doors and windows a room has."""
@@ -100,7 +139,7 @@ def plan_storey(
     solids: list[FloatArray] = []
     for idx, frame in enumerate(frames):
         spans = frame.open_spans([frames[other] for other, *_ in hidden[idx]])
-        for start, end, low in spans:
+        for start, end, bottom, top in spans:
             depth = _depth_at((start + end) / 2, hidden[idx])
             ends = frame.xy_of(start, end) + frame.back * depth / 2
             if not any(np.linalg.norm((one.ends - ends).mean(axis=0)) < thickest / 2 for one in openings):
@@ -108,31 +147,66 @@ def plan_storey(
                     frames[other].side.room for other, first, last, _ in hidden[idx] if first < end and start < last
                 }
                 rooms_beside = tuple(sorted({frame.side.room, *beyond}))
-                openings.append(Opening(ends, "door" if low else "window", rooms_beside, depth or None))
-        edges = [0.0, *(edge for start, end, _ in spans for edge in (start, end)), frame.length]
+                kind: Literal["door", "window"] = "window" if bottom else "door"
+                openings.append(Opening(ends, kind, bottom, top, rooms_beside, depth or None))
+        edges = [0.0, *(edge for start, end, *_ in spans for edge in (start, end)), frame.length]
         for start, end in zip(edges[::2], edges[1::2], strict=True):
             if end - start < least or frame.side.line >= len(lines):  # the edge of the extent
                 continue
             pieces = [(max(first, start), min(last, end), depth) for _, first, last, depth in hidden[idx]]
             pieces = [piece for piece in pieces if piece[1] - piece[0] > least]
             for first, last, depth in pieces:
-                # As far as the wall around the corner is thick.
-                before = max((_depth_at(frames[one].length, hidden[one])
-                              for one in _corners(frame, frames, 0) if first == 0), default=0.0)  # fmt: skip
-                after = max((_depth_at(0.0, hidden[one])
-                             for one in _corners(frame, frames, 1) if last == frame.length), default=0.0)  # fmt: skip
-                side = frame.xy_of(first - before, last + after)
+                side = frame.xy_of(*_to_corners(idx, first, last, frames=frames, hidden=hidden))
                 solids.append(np.concatenate([side, side[::-1] + frame.back * depth]))
             walls.append(Wall(frame.xy_of(start, end), frame.side.room, pieces[0][2] if pieces else None))
+    bodies = _bodies(frames, hidden, lines=len(lines), least=least)
     doors = [(one.ends, one.thickness or 0.0) for one in openings if one.kind == "door"]
     leaves = iter(
         door_leaves(doors, views(), lines=lines, storey=evidence.storey, cell=evidence.extent.pixel) if doors else ()
     )
     openings = [replace(one, leaf=next(leaves)) if one.kind == "door" else one for one in openings]
-    return StoreyPlan(rooms, measured.sizes(sides, storey=evidence.storey), walls, openings, solids)
+    return StoreyPlan(rooms, measured.sizes(sides, storey=evidence.storey), walls, openings, solids, bodies)
 
 
-def _depth_at(place: float, hidden: Sequence[tuple[int, float, float, float]]) -> float:
+def _bodies(
+    frames: Sequence[_Frame], hidden: Sequence[Sequence[Behind]], *, lines: int, least: float
+) -> list[WallBody]:
+    """Return the walls with their openings, each once, those on the edges of the extent left out."""
+    bodies = []
+    for idx, frame in enumerate(frames):
+        if frame.side.line >= lines:
+            continue
+        covered = [0.0]
+        for other, first, last, depth in sorted(hidden[idx], key=lambda one: one[1]):
+            first, last = max(first, 0.0), min(last, frame.length)
+            covered += [first, last]
+            if last - first > least and (idx < other or all(one[0] != idx for one in hidden[other])):
+                ends = frame.xy_of(*_to_corners(idx, first, last, frames=frames, hidden=hidden))
+                bodies.append(WallBody(ends, depth, (frame.side.room, frames[other].side.room)))
+        covered.append(frame.length)
+        bodies += [
+            WallBody(frame.xy_of(start, end), None, (frame.side.room,))
+            for start, end in zip(np.maximum.accumulate(covered[::2]), covered[1::2], strict=True)
+            if end - start > least
+        ]
+    return bodies
+
+
+def _to_corners(
+    idx: int, first: float, last: float, *, frames: Sequence[_Frame], hidden: Sequence[Sequence[Behind]]
+) -> tuple[float, float]:
+    """Return a piece of a side that at a corner goes on as far as the wall around it is thick."""
+    frame = frames[idx]
+    if first == 0:
+        around = _corners(frame, frames, 0)
+        first -= max((_depth_at(frames[one].length, hidden[one]) for one in around), default=0.0)
+    if last == frame.length:
+        around = _corners(frame, frames, 1)
+        last += max((_depth_at(0.0, hidden[one]) for one in around), default=0.0)
+    return first, last
+
+
+def _depth_at(place: float, hidden: Sequence[Behind]) -> float:
     """Return the thickness of a wall at a place along its side, 0 if unknown."""
     return next((depth for _, first, last, depth in hidden if first - depth <= place <= last + depth), 0.0)
 
@@ -215,26 +289,40 @@ class _Frame:
             scores[:, own[kept]] += other.scores[:, theirs[kept]]
         scores = scores.clip(-1, 1)
         if others:  # to another room
-            return [(*span, True) for span in self._spans(scores[_ROWS // 16 : _ROWS * 3 // 4])]
+            return [
+                Span(start, end, 0.0, self._levels(scores, start, end)[1])
+                for start, end in self._spans(scores[_ROWS // 16 : _ROWS * 3 // 4])
+            ]
         # Rows below window sills, and those of windows; both are open in doors.
         low, high = scores[_ROWS // 16 : _ROWS * 5 // 16], scores[_ROWS * 3 // 8 : _ROWS * 3 // 4]
         found = []
         for start, end in self._spans(high):
             part = slice(round(start / self.cell), round(end / self.cell))
-            found.append((start, end, bool(low[:, part].mean() > high[:, part].mean() / 2)))
+            bottom, top = self._levels(scores, start, end)
+            is_door = low[:, part].mean() > high[:, part].mean() / 2
+            found.append(Span(start, end, 0.0 if is_door else max(bottom, self.height / _ROWS), top))
         return found
+
+    def _levels(self, scores: FloatArray, start: float, end: float) -> tuple[float, float]:
+        """Return between which heights above the floor views see through a span."""
+        mean = scores[:, round(start / self.cell) : round(end / self.cell)].mean(axis=1)
+        opened = np.flatnonzero(mean > _OPEN)
+        runs = np.split(opened, np.flatnonzero(np.diff(opened) > 2) + 1)  # muntins are narrower
+        longest = max(runs, key=len)
+        if not len(longest):
+            return 0.0, self.height
+        return float(longest[0] / _ROWS * self.height), float((longest[-1] + 1) / _ROWS * self.height)
 
     def _spans(self, scores: FloatArray) -> list[tuple[float, float]]:
         """Return where rows of the side are open."""
         mean = scores.mean(axis=0)
-        # In nine rendered houses, these two limits find most of the openings and few others.
-        opened = np.flatnonzero(mean > 0.25)
+        opened = np.flatnonzero(mean > _OPEN)
         near = round(0.15 * self.height / self.cell)
         spans = []
         for part in np.split(opened, np.flatnonzero(np.diff(opened) > 0.06 * self.height / self.cell + 1) + 1):
             if len(part) and (part[-1] + 1 - part[0]) * self.cell >= 0.2 * self.height:
                 first, last = int(part[0]), int(part[-1]) + 1
                 around = np.concatenate([mean[max(first - near, 0) : first], mean[last : last + near], np.zeros(1)])
-                if mean[first:last].mean() > around.mean() + 0.6:
+                if mean[first:last].mean() > around.mean() + _MORE_OPEN:
                     spans.append((first * self.cell, last * self.cell))
         return spans

@@ -137,6 +137,23 @@ def test_a_wall_between_two_rooms_has_its_thickness_and_its_door(angle_deg: floa
     ends = door.ends @ turn
     assert ends[:, 0] == pytest.approx([4.1, 4.1], abs=0.02)
     assert np.sort(ends[:, 1]) == pytest.approx(DOOR, abs=0.1)
+    assert (door.bottom, door.top) == (0, pytest.approx(2.0, abs=0.1))
+    assert door.rooms == (0, 1)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 31.0])
+def test_each_wall_has_one_body_with_its_openings(angle_deg: float) -> None:
+    plan, _ = plan_of_flat(angle_deg)
+    (both,) = [body for body in plan.bodies if body.thickness is not None]
+    assert both.thickness == pytest.approx(0.2, abs=0.02)
+    assert set(both.rooms) == {0, 1}
+    assert np.linalg.norm(both.ends[1] - both.ends[0]) == pytest.approx(3.0, abs=0.05)
+    outer = [body for body in plan.bodies if body.thickness is None]
+    lengths = sorted(float(np.linalg.norm(body.ends[1] - body.ends[0])) for body in outer)
+    assert lengths == pytest.approx([3, 3, 3, 3, 4, 4], abs=0.05)
+    for opening in plan.openings:
+        (body,) = [one for one in plan.bodies if one.holds(opening)]
+        assert (body is both) == (opening.kind == "door")
 
 
 def test_a_window_does_not_reach_the_floor() -> None:
@@ -144,6 +161,8 @@ def test_a_window_does_not_reach_the_floor() -> None:
     (window,) = [one for one in plan.openings if one.kind == "window"]
     assert window.ends[:, 1] == pytest.approx([0, 0], abs=0.02)
     assert np.sort(window.ends[:, 0]) == pytest.approx(WINDOW, abs=0.15)
+    assert (window.bottom, window.top) == pytest.approx((1.0, 2.0), abs=0.1)
+    assert window.rooms == (0,)
 
 
 @pytest.mark.parametrize(("start", "behind"), [(-3.0, False), (2.0, True), (11.0, False)])

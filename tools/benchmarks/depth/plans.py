@@ -14,6 +14,7 @@ so that another run measures a change of the plan alone.
 * windows: the same of windows;
 * sizes: median and 95 % of the errors of length and width of the rooms that are found, and the share within twice
   their stated standard deviations; heights: the same of the heights of these rooms;
+* levels: median and 95 % of the errors of tops of openings and bottoms of windows;
 * leaves: open leaves of the doors that are drawn whose free ends are drawn within 30 cm, of all, and how many others.
 
 The walls of a house are those of the rooms in which a camera stands. Those of a capture are the places where its true
@@ -97,6 +98,7 @@ class TrueStorey:
     windows: list[FloatArray]
     height: float = np.nan
     leaf_ends: Sequence[tuple[float, float] | None] = ()  # of the doors
+    levels: Sequence[tuple[float, float]] = ()  # of the doors and then of the windows, above the floor
     parallel: bool = True
 
 
@@ -127,8 +129,11 @@ def true_storeys(name: str) -> list[TrueStorey]:
         }
         height = next(room.height for room in rooms if room.floor == floor)
         leaf_ends = [one.leaf_end for one in doors]
+        levels = [(one.bottom, one.top) for one in [*doors, *(one for one in own if one not in doors)]]
         walls = Samples.of(segments)
-        result.append(TrueStorey(floor, walls, rectangles, middles["doors"], middles["windows"], height, leaf_ends))
+        result.append(
+            TrueStorey(floor, walls, rectangles, middles["doors"], middles["windows"], height, leaf_ends, levels)
+        )
     return result
 
 
@@ -189,7 +194,20 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
         "sizes": np.array(sizes, np.float64).reshape(-1, 2),
         "heights": np.array(heights, np.float64).reshape(-1, 2),
         "leaves": _leaves(true, drawn),
+        "levels": _level_errors(true, drawn),
     } | openings
+
+
+def _level_errors(true: TrueStorey, drawn: dict[str, Any]) -> FloatArray:
+    """Return the errors of the tops of drawn openings, and of the bottoms of windows, where one is known."""
+    errors = []
+    middles = np.array([np.mean(ends, axis=0) for ends in (*true.doors, *true.windows)]).reshape(-1, 2)
+    for opening in drawn.get("openings", []) if true.levels else ():
+        away = np.linalg.norm(middles - np.mean(opening["ends"], axis=0), axis=1)
+        if len(away) and away.min() < _NEAR:
+            bottom, top = true.levels[int(away.argmin())]
+            errors += [opening["top"] - top] + ([opening["bottom"] - bottom] if opening["kind"] == "window" else [])
+    return np.array(errors, np.float64)
 
 
 def _leaves(true: TrueStorey, drawn: dict[str, Any]) -> NDArray[np.int64]:
@@ -289,6 +307,9 @@ def figures(found: dict[str, NDArray[Any]]) -> tuple[str, ...]:
         f"{area:.1f} %",
         *("{} of {}, {} wrong".format(*found[kind]) for kind in ("doors", "windows", "leaves")),
         *(_errors_text(found[kind]) for kind in ("sizes", "heights")),
+        "{:.0f}, {:.0f} cm".format(*np.quantile(np.abs(found["levels"]), [0.5, 0.95]) * 100)
+        if len(found["levels"])
+        else "–",
     )
 
 
@@ -320,4 +341,4 @@ def main() -> None:
         files = planned(capture, made, settings, folder=SCRATCH / "plans" / capture.name)
         rows.append((capture.name, *figures(measured(capture, files))))
     print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors", "windows", "leaves", "sizes",
-                 "heights"], rows)  # fmt: skip
+                 "heights", "levels"], rows)  # fmt: skip

@@ -76,7 +76,7 @@ class Room:
 class Opening:
     """A door, window, balcony or opening in a wall along x (axis 0) or y, from start to end, on a floor.
 
-    `leaf_end`: where the free end of a door's open leaf is, (x, y).
+    `bottom`, `top`: above the floor. `leaf_end`: where the free end of a door's open leaf is, (x, y).
     """
 
     axis: int
@@ -85,6 +85,8 @@ class Opening:
     end: float
     kind: str
     floor: float
+    bottom: float
+    top: float
     leaf_end: tuple[float, float] | None = None
 
 
@@ -252,8 +254,8 @@ def _wall(
     trim: Color = WHITE if builder.rng.random() < 0.5 else WOODS[int(builder.rng.integers(len(WOODS)))]
     at = start
     for a, b, kind in sorted(openings):
-        builder.openings.append(Opening(axis, line, a, b, kind, z))
         bottom, top = {"window": (0.9, 2.1), "balcony": (0.05, 2.15), "opening": (0.0, 2.3)}.get(kind, (0.0, _DOOR[1]))
+        builder.openings.append(Opening(axis, line, a, b, kind, z, bottom, top))
         add(at, a, 0.0, height, PLASTER, WHITE)
         add(a, b, top, height, PLASTER, WHITE)
         if bottom > 0:
