@@ -292,7 +292,8 @@ def test_hostile_names_of_floor_plans_are_left_out(blocks: Path, tmp_path: Path,
     (tmp_path / "secret.png").write_bytes(SECRET)
     block = runs / "block_0"
     (block / "floor_plan").mkdir()
-    storey = {"png": name, "floor": 0.0, "cut": 1.0, "corner": [0, 0], "size_px": [4, 4], "metres_per_pixel": 1.0}
+    storey = {"png": name, "floor": 0.0, "cut": 1.0, "corner": [0, 0], "size_px": [4, 4], "metres_per_pixel": 1.0,
+              "rooms": [{}]}  # fmt: skip
     about = {"file_from_world": np.eye(3).tolist(), "storeys": [storey]}
     (block / "floor_plan/floor_plan.json").write_text(json.dumps(about))
     plans, note = run_plans(load(block), Rigid3.identity())
@@ -306,7 +307,7 @@ def test_links_of_a_floor_plan_do_not_lead_outside(blocks: Path, tmp_path: Path)
     (block / "floor_plan").mkdir()
     write_png(tmp_path / "secret.png", np.zeros((4, 4, 3), np.uint8))
     (block / "floor_plan/plan.png").symlink_to(tmp_path / "secret.png")
-    about = {"file_from_world": np.eye(3).tolist(), "storeys": [{"png": "plan.png"}]}
+    about = {"file_from_world": np.eye(3).tolist(), "storeys": [{"png": "plan.png", "rooms": [{}]}]}
     (block / "floor_plan/floor_plan.json").write_text(json.dumps(about))
     assert "a link leads outside" in run_plans(load(block), Rigid3.identity())[1]
 

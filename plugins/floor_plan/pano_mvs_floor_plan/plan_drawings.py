@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -23,15 +22,13 @@ COLORS = {"wall": (24, 32, 56), "door": (214, 140, 36), "window": (60, 130, 220)
 """RGB colours of what a plan shows."""
 
 
-class DrawnRoom(Protocol):
-    """A room: its outline (N, 2), its area, and a position in it."""
+@dataclass(frozen=True, eq=False)
+class DrawnRoom:
+    """A room: its outline (N, 2), lines of text about it, and where they stand."""
 
-    @property
-    def outline(self) -> FloatArray: ...  # noqa: D102
-    @property
-    def area(self) -> float: ...  # noqa: D102
-    @property
-    def label_xy(self) -> FloatArray: ...  # noqa: D102
+    outline: FloatArray
+    text: Sequence[str]
+    label_xy: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +52,6 @@ def world_file_text(pixel: float, left: float, top: float) -> str:
     return "".join(f"{value:.12g}\n" for value in (pixel, 0, 0, -pixel, left + pixel / 2, top - pixel / 2))
 
 
-def area_text(area: float, *, superscript: str = "²") -> str:
-    """Return an area in square metres as text."""
-    return f"{area:.1f} m{superscript}"
-
-
 def svg_text(plan: PlanDrawing) -> str:
     """Return a plan as SVG; the lines of `walls`, `doors` and `windows` have the coordinates of the plan."""
     (left, bottom), (right, top) = plan.box
@@ -74,9 +66,11 @@ def svg_text(plan: PlanDrawing) -> str:
         for kind in ("door", "window")
         for which in ([ends for other, ends in plan.openings if other == kind],)
     ]
-    areas = [
-        f'<text x="{room.label_xy[0]:.5f}" y="{-room.label_xy[1] - size / 2:.5f}">{area_text(room.area)}</text>'
-        for room in (plan.rooms if plan.is_metric else ())
+    texts = [
+        f'<text x="{x:.5f}" y="{-y - size / 2 + 0.6 * size * number:.5f}">{escape(line, quote=False)}</text>'
+        for room in plan.rooms
+        for (x, y) in (room.label_xy.tolist(),)
+        for number, line in enumerate(room.text)
     ]
     dots = [
         f'<circle cx="{x:.5f}" cy="{y:.5f}" r="{size / 4:.4g}"><title>{escape(name, quote=False)}</title></circle>'
@@ -99,8 +93,8 @@ def svg_text(plan: PlanDrawing) -> str:
             *dots,
             "</g>",
             "</g>",
-            f'<g id="areas" font-size="{size / 2:.4g}" font-family="sans-serif" fill="#182038" text-anchor="middle">',
-            *areas,
+            f'<g id="rooms" font-size="{size / 2:.4g}" font-family="sans-serif" fill="#182038" text-anchor="middle">',
+            *texts,
             "</g>",
             f'<g id="scale" stroke="#182038" stroke-width="{size / 8:.4g}">',
             f'<path fill="none" d="M{start:.6g} {base - size / 3:.6g}v{2 * size / 3:.6g}m0 {-size / 3:.6g}'
@@ -129,7 +123,7 @@ def has_ezdxf() -> bool:
 def write_dxf(path: Path, plan: PlanDrawing) -> None:
     """Write a plan as DXF (AutoCAD 2010).
 
-    Lines are in the layers WALLS, DOORS and WINDOWS, outlines of rooms with their areas in ROOMS, circles and names in
+    Lines are in the layers WALLS, DOORS and WINDOWS, outlines of rooms with their sizes in ROOMS, circles and names in
     CAMERAS. The same plan gives the same bytes: no date is written.
 
     Raises:
@@ -153,10 +147,11 @@ def write_dxf(path: Path, plan: PlanDrawing) -> None:
         (left, bottom), (right, top) = plan.box
         for room in plan.rooms:
             space.add_lwpolyline(room.outline.tolist(), close=True, dxfattribs={"layer": "ROOMS"})
-            if plan.is_metric:
-                height = 0.01 * max(right - left, top - bottom)
-                text = space.add_text(area_text(room.area), height=height, dxfattribs={"layer": "ROOMS"})
-                text.set_placement(room.label_xy.tolist())
+            height = 0.01 * max(right - left, top - bottom)
+            x, y = room.label_xy.tolist()
+            for number, line in enumerate(room.text):
+                text = space.add_text(line, height=height, dxfattribs={"layer": "ROOMS"})
+                text.set_placement((x, y - 1.5 * height * number))
         radius = 0.006 * max(right - left, top - bottom)
         for name, place in plan.cameras.items():
             space.add_circle(place, radius, dxfattribs={"layer": "CAMERAS"})
@@ -169,6 +164,7 @@ def write_dxf(path: Path, plan: PlanDrawing) -> None:
 
 _PAPER = 255, 255, 255
 _SUBPIXEL_BITS = 4
+_ASCII = {ord("²"): "2", ord("×"): "x"}  # all that OpenCV's font has
 
 
 def strip_px(size_hw: tuple[int, int]) -> int:
@@ -203,13 +199,17 @@ def draw_plan(photo: NDArray[np.uint8], known: NDArray[np.bool_], plan: PlanDraw
     for x, y in pixels(np.array(list(plan.cameras.values())).reshape(-1, 2)).tolist():
         cv2.circle(image, (x, y), radius, _PAPER, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
         cv2.circle(image, (x, y), int(0.7 * radius), COLORS["camera"], -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-    for room in plan.rooms if plan.is_metric else ():
+    size, font = max(0.35, width / 1400), cv2.FONT_HERSHEY_SIMPLEX
+    for room in plan.rooms:
         x, y = (pixels(np.array(room.label_xy)) >> _SUBPIXEL_BITS).tolist()
-        text, size, font = area_text(room.area, superscript="2"), max(0.35, width / 1400), cv2.FONT_HERSHEY_SIMPLEX
-        (wide, high), below = cv2.getTextSize(text, font, size, 1)
-        x, y = x - wide // 2, y - 2 * (radius >> _SUBPIXEL_BITS)
-        cv2.rectangle(image, (x - below, y - high - below), (x + wide + below, y + below), _PAPER, -1)
-        cv2.putText(image, text, (x, y), font, size, COLORS["wall"], 1, cv2.LINE_AA)
+        lines = [line.translate(_ASCII) for line in room.text]
+        extents = [cv2.getTextSize(line, font, size, 1) for line in lines]
+        step = max((high + 2 * below for (_, high), below in extents), default=0)
+        y -= 2 * (radius >> _SUBPIXEL_BITS) + step * (len(lines) - 1)
+        for number, (line, ((wide, high), below)) in enumerate(zip(lines, extents, strict=True)):
+            left, base = x - wide // 2, y + step * number
+            cv2.rectangle(image, (left - below, base - high - below), (left + wide + below, base + below), _PAPER, -1)
+            cv2.putText(image, line, (left, base), font, size, COLORS["wall"], 1, cv2.LINE_AA)
     image[height:] = _PAPER
     _draw_bar(image[height:], plan, pixel)
     return image

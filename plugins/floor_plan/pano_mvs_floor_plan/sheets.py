@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ _INK, _FAINT, _PANE, _WALL = "#182038", "#7b8294", "#3c82dc", "#182038"
 _STYLE: Any = {  # matplotlib's type of the keys depends on its version
     "font.family": "DejaVu Sans",
     "text.color": _INK,
+    "text.parse_math": False,  # names may have dollar signs
     "pdf.fonttype": 42,  # text that one can search and copy
     "svg.fonttype": "none",
     "svg.hashsalt": "pano_mvs",  # the same plan gives the same bytes
@@ -218,7 +220,8 @@ def _page(page_mm: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
     from matplotlib import rc_context, rcParamsDefault
     from matplotlib.figure import Figure
 
-    with rc_context(rcParamsDefault), rc_context(_STYLE):  # without the user's own style
+    with rc_context(rcParamsDefault), rc_context(_STYLE), warnings.catch_warnings():  # without the user's own style
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # boxes in their place say enough
         figure = Figure((page_mm[0] / _INCH, page_mm[1] / _INCH))
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(0, page_mm[0]), ylim=(0, page_mm[1]))
@@ -375,10 +378,9 @@ def _room_text(name: str, size: RoomSize, settings: SheetSettings, *, is_ceiling
         return [name, height]
     std = max(size.length.std, size.width.std)
     error = "" if np.isnan(std) else f" ± {max(2 * std, 0.005):.2f}"
-    most = "" if size.is_rectangle else "max. "
     return [
         name,
-        f"{most}{size.length.value:.2f} × {size.width.value:.2f}{error} {length}",
+        f"{size.extent_text}{error} {length}",
         measure_text(size.area, area, digits=1),
         height,
     ]

@@ -50,6 +50,12 @@ class RoomSize:
     height: Measure
     sides: list[Measure]
 
+    @property
+    def extent_text(self) -> str:
+        """Length and width as text; the largest ones of a room that is not a rectangle are called so."""
+        most = "" if self.is_rectangle else "max. "
+        return f"{most}{self.length.value:.2f} × {self.width.value:.2f}"
+
 
 def volume_of(size: RoomSize) -> Measure:
     """Return the volume below a level ceiling."""

@@ -36,6 +36,7 @@ from pano_mvs_floor_plan.evidence import CloudViews, Evidence, PlanView, range_v
 from pano_mvs_floor_plan.ifc import IFC_REMEDY, BuildingSettings, has_ifcopenshell, write_ifc
 from pano_mvs_floor_plan.plan_drawings import (
     DXF_REMEDY,
+    DrawnRoom,
     PlanDrawing,
     draw_plan,
     has_ezdxf,
@@ -47,6 +48,7 @@ from pano_mvs_floor_plan.plan_drawings import (
 from pano_mvs_floor_plan.room_table import write_rooms_csv
 from pano_mvs_floor_plan.rooms import Room
 from pano_mvs_floor_plan.sheets import SheetSettings, StoreySheet, page_bytes, write_sheets
+from pano_mvs_floor_plan.sizes import RoomSize
 from pano_mvs_floor_plan.wall_lines import Line
 from pano_mvs_floor_plan.walls_and_openings import plan_storey
 
@@ -305,7 +307,10 @@ class _GroupPlan:
             np.array([wall.ends for wall in plan.walls]).reshape(-1, 2, 2),
             plan.solids,
             [(opening.kind, opening.ends) for opening in plan.openings],
-            plan.rooms,
+            [
+                DrawnRoom(room.outline, self._room_text(size), room.label_xy)
+                for room, size in zip(plan.rooms, plan.sizes, strict=True)
+            ],
             names,
             box,
             bar,
@@ -369,6 +374,12 @@ class _GroupPlan:
             ],
             "cameras": {name: list(place) for name, place in names.items()},
         }, sheet
+
+    def _room_text(self, size: RoomSize) -> list[str]:
+        """Return what the drawings state of a room; nothing without a unit that one knows."""
+        if not self.poses.metric:
+            return []
+        return [f"{size.area.value:.1f} m²", f"{size.extent_text} m"]
 
     def _room_name(self, number: int, room: Room, cameras: Mapping[str, tuple[float, float]]) -> str:
         """Return the name that the settings give a room by a panorama in it, or else its number."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
-from pano_mvs_floor_plan.plan_drawings import COLORS, PlanDrawing, draw_plan
+from pano_mvs_floor_plan.plan_drawings import COLORS, DrawnRoom, PlanDrawing, draw_plan
 
 
 def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:
-    room = SimpleNamespace(outline=np.zeros((0, 2)), area=6.0, label_xy=np.array([1.0, 1.0]))
+    room = DrawnRoom(np.zeros((0, 2)), ["6.0 m²", "3.00 × 2.00 m"], np.array([1.0, 1.0]))
     plan = PlanDrawing(
         "plan",
         np.array([[[0.5, 0.5], [3.5, 0.5]]]),
@@ -30,7 +28,8 @@ def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:
     assert dark[25:35, 60:140].all()
     assert picture[50, 200].tolist() == list(COLORS["camera"])
     assert picture[100, 275].tolist() == list(COLORS["door"])
-    assert (picture[70:105, 60:140].max(axis=-1) < 200).any()  # the area
+    for rows in (slice(74, 86), slice(88, 100)):  # the area, and below it the size
+        assert (picture[rows, 60:140].max(axis=-1) < 200).any()
     bar = np.flatnonzero(dark[200 + 18])
     longest = max(np.split(bar, np.flatnonzero(np.diff(bar) > 1) + 1), key=len)
     assert abs(len(longest) - 100) <= 3  # 1 m

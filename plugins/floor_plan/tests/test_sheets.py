@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import re
 from dataclasses import replace
@@ -181,6 +182,13 @@ def test_a_plan_that_is_turned_lies_along_the_paper(tmp_path: Path) -> None:
     wide, high = extent_mm(files)
     assert wide == pytest.approx(7200 / 50, abs=1.5)
     assert high == pytest.approx(3000 / 50, abs=1.5)
+
+
+def test_any_name_is_text(tmp_path: Path) -> None:
+    names = {"0.jpg": "$x^2$ & <b>", "2.jpg": "台所"}
+    files, _ = planned(tmp_path, sheets=("pdf", "svg", "png"), title="$5 _{ flat", room_names=names)
+    shown = [html.unescape(text) for text in texts(files)]
+    assert {"$5 _{ flat", *names.values()} <= set(shown)
 
 
 def test_the_same_plan_gives_the_same_bytes(tmp_path: Path) -> None:

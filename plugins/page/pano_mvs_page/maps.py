@@ -121,7 +121,10 @@ class StoreyMap:
 
 
 def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap], str]:
-    """Return the floor plans of the largest group of a run, one per storey, and a note, or ""."""
+    """Return the floor plans of the largest group of a run, one per storey, and a note, or "".
+
+    Without any room, as outdoors, there are none: the cloud from above shows more.
+    """
     if not run.has_file(PLAN):
         return [], ""
     path = run.out / PLAN
@@ -130,6 +133,8 @@ def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap],
         file_from_world = np.array(about["file_from_world"], np.float64).reshape(3, 3)
         page_from_file = page_from_world @ Rigid3(file_from_world.T, np.zeros(3))
         storeys = [entry for entry in about["storeys"] if "png" in entry]
+        if not any(entry["rooms"] for entry in storeys):
+            return [], ""
         plans = [
             _storey(entry, decode_image(path_inside(path.parent, str(entry["png"]))), page_from_file)
             for entry in storeys

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -76,7 +77,7 @@ def test_without_a_floor_plan_the_cloud_is_the_map(tmp_path: Path) -> None:
     assert described["heights"] is None
 
 
-def floor_plan(out: Path, count: int) -> None:
+def floor_plan(out: Path, count: int, *, rooms: int = 1) -> None:
     """Write floor plans as `export.floor_plan` does, 4 by 2 units around the origin, one storey above the other."""
     (out / "floor_plan").mkdir()
     storeys = []
@@ -84,7 +85,13 @@ def floor_plan(out: Path, count: int) -> None:
         picture = np.full((50, 100, 3), 255, np.uint8)
         picture[:25, :50] = (200, 0, 0)
         write_png(out / "floor_plan" / f"storey_{number}.png", picture)
-        entry = {"png": f"storey_{number}.png", "origin_xy": [-2.0, 1.0], "units_per_pixel": 0.04, "size_px": [100, 50]}
+        entry: dict[str, Any] = {
+            "png": f"storey_{number}.png",
+            "origin_xy": [-2.0, 1.0],
+            "units_per_pixel": 0.04,
+            "size_px": [100, 50],
+        }
+        entry["rooms"] = [{}] * rooms if number == 0 else []
         storeys.append({**entry, "z_range": [3.0 * number - 1.5, 3.0 * number + 1.5]})
     about = {"file_from_world": z_up_from_world().tolist(), "storeys": storeys}
     (out / "floor_plan" / "floor_plan.json").write_text(json.dumps(about))
@@ -107,6 +114,12 @@ def test_floor_plans_lie_where_they_were_drawn(tmp_path: Path) -> None:
     share_run(load(run.out), tmp_path / "page")
     maps = value_of(tmp_path / "page" / "data" / "scene.js")["maps"]
     assert [entry["heights"] for entry in maps] == [pytest.approx(plan.heights) for plan in plans]
+
+
+def test_where_no_room_was_found_the_cloud_is_the_map(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=500)
+    floor_plan(run.out, 2, rooms=0)
+    assert run_plans(load(run.out), frame_of_page()) == ([], "")
 
 
 def test_a_damaged_floor_plan_is_named(tmp_path: Path) -> None:
