@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from tools.benchmarks.depth.ablation import Ablation, gains, place_rows, real_ro
 from tools.benchmarks.depth.layouts import OPENING, layout_ranges, view_shares
 from tools.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
 from tools.benchmarks.depth.places import SYNTHETIC, Place, masked, places_of
-from tools.benchmarks.depth.plans import Samples, compared, figures, true_storeys
+from tools.benchmarks.depth.plans import Samples, TrueStorey, compared, figures, true_storeys
 from tools.benchmarks.depth.scores import completeness, kept_at_precision, score_place, thicknesses
 from tools.benchmarks.poses.tours.materials import PLASTER
 from tools.benchmarks.poses.tours.plan import level_rotation
@@ -322,14 +323,50 @@ def test_the_true_plan_of_a_house_has_no_errors() -> None:
     lower, upper = true_storeys("house_08")
     assert upper.floor > lower.floor + 2
     for storey in (lower, upper):
-        rooms = [{"outline": [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]} for x0, y0, x1, y1 in storey.rooms]
-        drawn = {"rooms": rooms, "openings": [{"kind": "door", "ends": door} for door in storey.doors]}
-        count, doors = len(rooms), len(storey.doors)
+        drawn = drawn_as_it_is(storey)
+        count, doors, leaves = len(storey.rooms), len(storey.doors), sum(end is not None for end in storey.leaf_ends)
         assert count > 3
+        assert leaves > 0
         assert figures(compared(storey, storey.walls, drawn)) == (
             *("100.0 %", "0.0 cm", "0.0 cm", "0.0 %"),
             *(f"{count} of {count}", "0.0 %", f"{doors} of {doors}, 0 wrong", f"0 of {len(storey.windows)}, 0 wrong"),
+            f"{leaves} of {leaves}, 0 wrong",
+            *(f"0.0, 0.0 cm, 100 % of {2 * count}", f"0.0, 0.0 cm, 100 % of {count}", "0, 0 cm"),
         )
+
+
+def drawn_as_it_is(storey: TrueStorey) -> dict[str, Any]:
+    """Return what floor_plan.json would state of a storey without an error; no window is drawn."""
+    rooms = [
+        {
+            "outline": [(x0, y0), (x1, y0), (x1, y1), (x0, y1)],
+            "size": sorted((x1 - x0, y1 - y0), reverse=True),
+            "size_stds": [0.01, 0.01],
+            "height": storey.height,
+            "height_std": 0.01,
+        }
+        for x0, y0, x1, y1 in storey.rooms
+    ]
+    openings = [
+        {"kind": "door", "ends": door, "leaf": end and {"open_end": end}, "bottom": bottom, "top": top}
+        for door, end, (bottom, top) in zip(storey.doors, storey.leaf_ends, storey.levels, strict=False)
+    ]
+    return {"rooms": rooms, "openings": openings}
+
+
+def test_sizes_and_leaves_that_are_wrong_are_counted() -> None:
+    (storey,) = true_storeys("house_11")
+    drawn = drawn_as_it_is(storey)
+    drawn["rooms"][0]["size"][0] += 0.05  # five times its standard deviation
+    door = next(one for one in drawn["openings"] if one["leaf"])
+    door["leaf"] = {"open_end": (door["leaf"]["open_end"][0], door["leaf"]["open_end"][1] + 1.0)}
+    door["top"] += 0.2
+    found = compared(storey, storey.walls, drawn)
+    sizes, leaves = found["sizes"], sum(end is not None for end in storey.leaf_ends)
+    assert np.abs(sizes[:, 0]).max() == pytest.approx(0.05)
+    assert np.mean(np.abs(sizes[:, 0]) <= 2 * sizes[:, 1]) == pytest.approx(1 - 1 / len(sizes))
+    assert found["leaves"].tolist() == [leaves - 1, leaves, 1]
+    assert np.abs(found["levels"]).max() == pytest.approx(0.2)
 
 
 def test_a_plan_that_is_moved_has_its_errors() -> None:
