@@ -142,11 +142,20 @@ WINDOW = (1.0, 2.5)
 """Where the lower wall of the first room has a window, from 1 m to 2 m, with a wall of a house 3 m behind it."""
 
 
-def flat_ranges(cam_from_world: Rigid3, *, turn: FloatArray, size_hw: tuple[int, int] = (128, 256)) -> RangeMap:
-    """Return the exact range map of a camera in the two rooms, turned by `turn`, (2, 2), about the origin; z up."""
+Panel = tuple[FloatArray, FloatArray, float, float]
+"""An upright surface: the positions of its ends, its lower and its upper edge."""
+
+
+def flat_ranges(
+    cam_from_world: Rigid3, *, turn: FloatArray, size_hw: tuple[int, int] = (128, 256), more: Sequence[Panel] = ()
+) -> RangeMap:
+    """Return the exact range map of a camera in the two rooms, turned by `turn`, (2, 2), about the origin; z up.
+
+    `more`: further surfaces in the rooms.
+    """
     (west, east), height = FLAT, HEIGHT
     panels = [(start, end, 0.0, height) for low, high in FLAT for start, end in walls_of(_rectangle(low, high))]
-    keep = [one for one in panels if not _crosses(one)]
+    keep = [*(one for one in panels if not _crosses(one)), *more]
     for x in (west[1][0], east[0][0]):
         keep += [(np.array([x, 0.0]), np.array([x, DOOR[0]]), 0.0, height)]
         keep += [(np.array([x, DOOR[1]]), np.array([x, 3.0]), 0.0, height)]
@@ -177,7 +186,7 @@ def _rectangle(low: tuple[float, float], high: tuple[float, float]) -> tuple[tup
     return (low, (high[0], low[1]), high, (low[0], high[1]))
 
 
-def _crosses(panel: tuple[FloatArray, FloatArray, float, float]) -> bool:
+def _crosses(panel: Panel) -> bool:
     """Return whether a wall has the door or the window."""
     x, y = (panel[0] + panel[1]) / 2
     return x in (4.0, 4.2) or (y == 0.0 and x < 4.0)

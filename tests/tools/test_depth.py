@@ -331,7 +331,7 @@ def test_the_true_plan_of_a_house_has_no_errors() -> None:
             *("100.0 %", "0.0 cm", "0.0 cm", "0.0 %"),
             *(f"{count} of {count}", "0.0 %", f"{doors} of {doors}, 0 wrong", f"0 of {len(storey.windows)}, 0 wrong"),
             f"{leaves} of {leaves}, 0 wrong",
-            *(f"0.0, 0.0 cm, 100 % of {2 * count}", f"0.0, 0.0 cm, 100 % of {count}", "0, 0 cm"),
+            *(f"0.0, 0.0 cm, 100 % of {2 * count}", f"0.0, 0.0 cm, 100 % of {count}", "0, 0 cm", "0, 0 cm"),
         )
 
 

@@ -28,8 +28,9 @@ IFC_REMEDY = "IFC files need the package ifcopenshell: pip install 'pano-mvs[ifc
 
 _UNKNOWN_THICKNESS = 0.01  # metres, of the body that stands for a wall of which one side was seen
 _MARGIN = 0.05  # metres, by which the volume of an opening goes beyond its wall
+_WIDEST_DOOR = 0.5  # of the storey's height; wider openings without a leaf are passages
 _LEAF, _PANE = 0.04, 0.02  # metres, thickness of what is drawn in openings
-_DIGITS = 4  # of lengths in metres
+_DIGITS, _ANGLE_DIGITS = 4, 6  # of lengths in metres, and of unit vectors
 _NAMESPACE = uuid.UUID("5f0c7d0e-3a5e-4d0b-9b39-6f2b1a0c9d51")
 
 
@@ -39,7 +40,7 @@ class BuildingSettings:
 
     Attributes:
         title: name of the project.
-        key: text that no other plan has, from which identifiers are made.
+        key: text from which identifiers are made; the same for a newer model of the same place.
         has_north: whether +y is north.
         origin_lla: latitude (deg), longitude (deg) and altitude (m) of the origin; None if unknown.
     """
@@ -56,7 +57,7 @@ def has_ifcopenshell() -> bool:
 
 
 def write_ifc(path: Path, storeys: Sequence[StoreySheet], settings: BuildingSettings) -> None:
-    """Write the storeys of a plan in metres, z up, as a building.
+    """Write the storeys of a plan with rooms in metres, z up, as a building.
 
     Rooms are spaces with their quantities; walls have their openings, and these their windows and doors. A wall of
     which one side was seen is 1 cm thick, and its properties say that the thickness is not known. The same plan gives
@@ -114,6 +115,7 @@ class _Building:
         if self._storeys:
             self._aggregate("building", self._building, self._storeys)
         header = self._model.header
+        header.file_description.description = ("ViewDefinition [DesignTransferView_V1.0]",)
         header.file_name.name = path.name
         header.file_name.time_stamp = "1970-01-01T00:00:00"
         header.file_name.preprocessor_version = header.file_name.originating_system = "pano_mvs"
@@ -138,17 +140,23 @@ class _Building:
             space = self._root("IfcSpace", key, title, None, None, own, shape, title, "ELEMENT", "INTERNAL")
             spaces.append(space)
             volume = volume_of(size)
+            heights = [
+                ("IfcQuantityLength", "FinishCeilingHeight", size.height.value),
+                ("IfcQuantityVolume", "NetVolume", volume.value),
+            ]
+            heights = [one for one in heights if not np.isnan(one[2])]
             self._quantities(key, space, "Qto_SpaceBaseQuantities", [
                 ("IfcQuantityArea", "NetFloorArea", size.area.value),
                 ("IfcQuantityLength", "NetPerimeter", size.perimeter),
-                *([("IfcQuantityLength", "FinishCeilingHeight", size.height.value),
-                   ("IfcQuantityVolume", "NetVolume", volume.value)] if is_known else []),
+                *heights,
             ])  # fmt: skip
-            stds = {"NetFloorArea": size.area.std, "Length": size.length.std, "Width": size.width.std,
-                    "FinishCeilingHeight": size.height.std, "NetVolume": volume.std}  # fmt: skip
+            known = {"Length": size.length, "Width": size.width, "NetFloorArea": size.area,
+                     "FinishCeilingHeight": size.height, "NetVolume": volume}  # fmt: skip
             self._properties(key, space, {
                 "HeightIsKnown": is_known,
-                **{f"{which}StandardDeviation": std for which, std in stds.items() if not np.isnan(std)},
+                "WallsSeenOnAllSides": size.is_closed,
+                **{which: one.value for which, one in list(known.items())[:2] if not np.isnan(one.value)},
+                **{f"{which}StandardDeviation": one.std for which, one in known.items() if not np.isnan(one.std)},
             })  # fmt: skip
         if spaces:
             self._aggregate(name, storey, spaces)
@@ -160,11 +168,8 @@ class _Building:
 
     def _wall(self, key: str, body: WallBody, sheet: StoreySheet, *, place: Any) -> list[Any]:
         """Add a wall with what is in it, and return what its storey contains."""
-        way = body.ends[1] - body.ends[0]
-        along = way / np.linalg.norm(way)
-        back = np.array([along[1], -along[0]])
         thickness = body.thickness or _UNKNOWN_THICKNESS
-        footprint = np.concatenate([body.ends, body.ends[::-1] + thickness * back])[::-1]
+        footprint = np.concatenate([body.ends, body.ends[::-1] + thickness * body.back])[::-1]
         shape = self._extruded(footprint, height=sheet.height)
         own = self._placement(place, (0.0, 0.0, 0.0))
         wall = self._root("IfcWall", key, f"Wall {key.rpartition('/')[2]}", None, None, own, shape, None, "NOTDEFINED")
@@ -172,39 +177,49 @@ class _Building:
         if body.thickness is not None:
             self._quantities(key, wall, "Qto_WallBaseQuantities", [("IfcQuantityLength", "Width", body.thickness)])
         elements = [wall]
-        for number, opening in enumerate(sheet.plan.openings):
-            if body.holds(opening):
-                elements += self._opening(f"{key}/{number}", opening, wall, place=place, sides=(back, thickness))
+        for number, opening in enumerate(sheet.plan.openings_of(body)):
+            hole = self._hole(f"{key}/{number}", opening, body, place=place)
+            self._root("IfcRelVoidsElement", f"{key}/{number}/voids", None, None, wall, hole)
+            if opening.leaf or opening.kind == "window" or opening.width < _WIDEST_DOOR * sheet.height:
+                elements.append(self._filling(f"{key}/{number}", opening, hole))
         return elements
 
-    def _opening(
-        self, key: str, opening: Opening, wall: Any, *, place: Any, sides: tuple[FloatArray, float]
-    ) -> list[Any]:
-        """Add an opening in a wall and what fills it, and return this."""
-        back, thickness = sides
-        middle = opening.ends if opening.thickness else opening.ends + thickness / 2 * back
-        height = opening.top - opening.bottom
+    def _hole(self, key: str, opening: Opening, body: WallBody, *, place: Any) -> Any:
+        """Add an opening, whose y axis is the way through it, for a door to the side on which its leaf opens."""
+        thickness = body.thickness or _UNKNOWN_THICKNESS
+        through = body.back
+        if opening.leaf and (opening.leaf.open_end - opening.leaf.hinge) @ through < 0:
+            through = -through
+        right = np.array([through[1], -through[0]])
+        corner = min(opening.ends, key=lambda end: float(end @ right))
+        if body.thickness is None:  # from the side that was seen into the middle
+            corner = corner + thickness / 2 * body.back
+        own = self._placement(place, (*corner, opening.bottom), right=right)
+        deep = thickness + 2 * _MARGIN
+        shape = self._box(opening, deep)
+        return self._root("IfcOpeningElement", f"{key}/hole", "Opening", None, None, own, shape, None, "OPENING")
 
-        def box(deep: float) -> Any:
-            outline = np.concatenate([middle - deep / 2 * back, middle[::-1] + deep / 2 * back])
-            return self._extruded(_counter_clockwise(outline), height=height)
+    def _box(self, opening: Opening, deep: float) -> Any:
+        """Return the shape of what is as wide and as high as an opening, from its left edge on."""
+        half, wide = deep / 2, opening.width
+        outline = np.array([[0.0, -half], [wide, -half], [wide, half], [0.0, half]])
+        return self._extruded(outline, height=opening.top - opening.bottom)
 
-        own = self._placement(place, (0.0, 0.0, opening.bottom))
-        hole = self._root("IfcOpeningElement", f"{key}/hole", "Opening", None, None, own, box(thickness + 2 * _MARGIN),
-                          None, "OPENING")  # fmt: skip
-        self._root("IfcRelVoidsElement", f"{key}/voids", None, None, wall, hole)
-        inside = self._placement(own, (0.0, 0.0, 0.0))
-        sizes = (_rounded(height), _rounded(opening.width))
+    def _filling(self, key: str, opening: Opening, hole: Any) -> Any:
+        """Add the window or the door in an opening."""
+        inside = self._placement(hole.ObjectPlacement, (0.0, 0.0, 0.0))
+        sizes = (_rounded(opening.top - opening.bottom), _rounded(opening.width))
         if opening.kind == "window":
-            filling = self._root("IfcWindow", key, "Window", None, None, inside, box(_PANE), None, *sizes, "WINDOW")
+            shape = self._box(opening, _PANE)
+            filling = self._root("IfcWindow", key, "Window", None, None, inside, shape, None, *sizes, "WINDOW")
         else:
             # What closes it is only shown where it was seen.
-            shape = box(_LEAF) if opening.leaf else None
+            shape = self._box(opening, _LEAF) if opening.leaf else None
             kind = ("DOOR", _swing(opening.leaf)) if opening.leaf else ("NOTDEFINED", "NOTDEFINED")
             filling = self._root("IfcDoor", key, "Door", None, None, inside, shape, None, *sizes, *kind)
             self._properties(key, filling, {"LeafWasSeen": opening.leaf is not None})
         self._root("IfcRelFillsElement", f"{key}/fills", None, None, hole, filling)
-        return [filling]
+        return filling
 
     def _new(self, kind: str, *values: Any) -> Any:
         return self._model.create_entity(kind, *values)
@@ -237,8 +252,13 @@ class _Building:
     def _point(self, *values: float) -> Any:
         return self._new("IfcCartesianPoint", tuple(_rounded(value) for value in values))
 
-    def _placement(self, within: Any, origin: tuple[float, float, float]) -> Any:
-        return self._new("IfcLocalPlacement", within, self._new("IfcAxis2Placement3D", self._point(*origin)))
+    def _placement(self, within: Any, origin: tuple[float, float, float], *, right: FloatArray | None = None) -> Any:
+        """Return a place within another one, with z up and x to the right, as there by default."""
+        turn = []
+        if right is not None:
+            directions = ((0.0, 0.0, 1.0), (*(round(float(one), _ANGLE_DIGITS) + 0.0 for one in right), 0.0))
+            turn = [self._new("IfcDirection", direction) for direction in directions]
+        return self._new("IfcLocalPlacement", within, self._new("IfcAxis2Placement3D", self._point(*origin), *turn))
 
     def _extruded(self, outline: FloatArray, *, height: float, holes: Sequence[FloatArray] = ()) -> Any:
         """Return the shape of an outline (N, 2), counter-clockwise, that goes up by a height."""
@@ -259,13 +279,8 @@ def _rounded(value: float) -> float:
     return round(float(value), _DIGITS) + 0.0
 
 
-def _counter_clockwise(outline: FloatArray) -> FloatArray:
-    x, y = outline.T
-    return outline if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0 else outline[::-1]
-
-
 def _swing(leaf: DoorLeaf) -> str:
-    """Return on which side a leaf is hinged for one who sees it open away from them."""
+    """Return on which side a leaf is hinged for one who looks towards the side on which it opens."""
     closed, opened = leaf.closed_end - leaf.hinge, leaf.open_end - leaf.hinge
     is_left = closed[0] * opened[1] - closed[1] * opened[0] > 0
     return "SINGLE_SWING_LEFT" if is_left else "SINGLE_SWING_RIGHT"

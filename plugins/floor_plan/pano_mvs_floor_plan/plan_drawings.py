@@ -66,11 +66,12 @@ def svg_text(plan: PlanDrawing) -> str:
         for kind in ("door", "window")
         for which in ([ends for other, ends in plan.openings if other == kind],)
     ]
+    step = 0.6 * size
     texts = [
-        f'<text x="{x:.5f}" y="{-y - size / 2 + 0.6 * size * number:.5f}">{escape(line, quote=False)}</text>'
+        f'<text x="{x:.5f}" y="{-y - size / 2 + step * number:.5f}">{escape(line, quote=False)}</text>'
         for room in plan.rooms
         for (x, y) in (room.label_xy.tolist(),)
-        for number, line in enumerate(room.text)
+        for number, line in enumerate(room.text, 1 - len(room.text))
     ]
     dots = [
         f'<circle cx="{x:.5f}" cy="{y:.5f}" r="{size / 4:.4g}"><title>{escape(name, quote=False)}</title></circle>'
@@ -207,9 +208,9 @@ def draw_plan(photo: NDArray[np.uint8], known: NDArray[np.bool_], plan: PlanDraw
         step = max((high + 2 * below for (_, high), below in extents), default=0)
         y -= 2 * (radius >> _SUBPIXEL_BITS) + step * (len(lines) - 1)
         for number, (line, ((wide, high), below)) in enumerate(zip(lines, extents, strict=True)):
-            left, base = x - wide // 2, y + step * number
-            cv2.rectangle(image, (left - below, base - high - below), (left + wide + below, base + below), _PAPER, -1)
-            cv2.putText(image, line, (left, base), font, size, COLORS["wall"], 1, cv2.LINE_AA)
+            start, base = x - wide // 2, y + step * number
+            cv2.rectangle(image, (start - below, base - high - below), (start + wide + below, base + below), _PAPER, -1)
+            cv2.putText(image, line, (start, base), font, size, COLORS["wall"], 1, cv2.LINE_AA)
     image[height:] = _PAPER
     _draw_bar(image[height:], plan, pixel)
     return image

@@ -19,7 +19,7 @@ def write_rooms_csv(path: Path, storeys: Sequence[StoreySheet], *, is_metric: bo
     """
     unit = "m" if is_metric else "units"
     measures = (f"length_{unit}", f"width_{unit}", f"height_{unit}", f"area_{unit}2", f"volume_{unit}3")
-    head = ["storey", "room", "is_rectangle"]
+    head = ["storey", "room", "is_closed", "is_rectangle"]
     head += [column for name in measures for column in (name, f"{name}_std")]
     head += [f"perimeter_{unit}", f"wall_area_{unit}2", "doors", "windows"]
     with path.open("w", newline="", encoding="utf-8") as stream:
@@ -31,7 +31,7 @@ def write_rooms_csv(path: Path, storeys: Sequence[StoreySheet], *, is_metric: bo
                 counts = storey.plan.opening_counts(room)
                 walls = size.perimeter * size.height.value
                 writer.writerow(
-                    [storey.name, name, str(size.is_rectangle).lower()]
+                    [storey.name, name, *(str(one).lower() for one in (size.is_closed, size.is_rectangle))]
                     + [_text(part) for value in values for part in value]
                     + [_text(size.perimeter), _text(walls), counts["door"], counts["window"]]
                 )

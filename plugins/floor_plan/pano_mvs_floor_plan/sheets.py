@@ -150,10 +150,16 @@ def write_sheets(
     if not drawn:
         return {}, ["no sheets: no room was found"]
     layout = _layout(drawn, settings)
-    notes = []
+    notes: list[str] = []
     if settings.scale and layout.scale != settings.scale:
-        held = f"1:{layout.scale} is used" if settings.is_metric else "no scale is known"
-        notes.append(f"the plan does not fit on {settings.paper.upper()} at 1:{settings.scale}: {held}")
+        notes.append(
+            f"the plan does not fit on {settings.paper.upper()} at 1:{settings.scale}: 1:{layout.scale} is used"
+            if settings.is_metric
+            else f"sheets are not at 1:{settings.scale}: no length is known"
+        )
+    if len(drawn) < len(storeys):
+        empty = ", ".join(storey.title for storey in storeys if not storey.plan.rooms)
+        notes.append(f"no sheet of {empty}: no room was found")
     files: dict[str, dict[str, str]] = {storey.name: {} for storey in drawn}
     pictures = [suffix for suffix in ("svg", "png") if suffix in formats]
     for storey in drawn:
@@ -195,6 +201,7 @@ def _layout(storeys: Sequence[StoreySheet], settings: SheetSettings) -> _Layout:
             *(room.outline for room in storey.plan.rooms),
             *storey.plan.solids,
             *(one.ends for one in storey.plan.openings),
+            *(one.leaf.reach for one in storey.plan.openings if one.leaf),
         )
     ]
     turned = np.concatenate(parts) @ turn.T
@@ -336,11 +343,16 @@ def _draw_opening(axes: Axes, opening: Opening, layout: _Layout, *, has_text: bo
         )
         wedges.append(np.array([hinge, free, hinge + (free - hinge) + (closed - hinge), closed]))
     if has_text:
-        turn = float(np.degrees(np.arctan2(along[1], along[0])) + 90) % 180 - 90
+        turn = _reading_angle(along)
         x, y = ends.mean(axis=0).tolist()
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
-        axes.text(x, y, f"{opening.width:.2f}", size=4.5, rotation=turn, ha="center", va="center", bbox=box)
+        axes.text(x, y, f"{opening.width:.1f}", size=4.5, rotation=turn, ha="center", va="center", bbox=box)
     return wedges
+
+
+def _reading_angle(along: FloatArray) -> float:
+    """Return the angle (deg) of text along a direction that is read from below or from the right."""
+    return (round(float(np.degrees(np.arctan2(along[1], along[0]))), 3) + 89.9) % 180 - 89.9
 
 
 def _draw_side_lengths(axes: Axes, room: Room, size: RoomSize, layout: _Layout) -> None:
@@ -352,16 +364,18 @@ def _draw_side_lengths(axes: Axes, room: Room, size: RoomSize, layout: _Layout) 
             continue
         along = (end - start) / long
         x, y = ((start + end) / 2 + 1.8 * np.array([-along[1], along[0]])).tolist()
-        turn = float(np.degrees(np.arctan2(along[1], along[0])) + 90) % 180 - 90
+        turn = _reading_angle(along)
         axes.text(x, y, f"{length.value:.2f}", size=5, rotation=turn, color=_FAINT, ha="center", va="center")
 
 
 def measure_text(measure: Measure, unit: str, *, digits: int = 2) -> str:
-    """Return a measure with twice its standard deviation.
+    """Return a measure with twice its standard deviation; "unknown" if it is NaN.
 
     >>> measure_text(Measure(2.5, 0.006), "m"), measure_text(Measure(2.5, float("nan")), "m")
     ('2.50 ± 0.01 m', '2.50 m')
     """
+    if np.isnan(measure.value):
+        return "unknown"
     error = "" if np.isnan(measure.std) else f" ± {max(2 * measure.std, 0.5 * 10**-digits):.{digits}f}"
     return f"{measure.value:.{digits}f}{error} {unit}".rstrip()
 
@@ -376,12 +390,12 @@ def _room_text(name: str, size: RoomSize, settings: SheetSettings, *, is_ceiling
     height = "height unknown" if np.isnan(size.height.value) else f"h {measure_text(size.height, length)}"
     if is_ceiling:
         return [name, height]
-    std = max(size.length.std, size.width.std)
-    error = "" if np.isnan(std) else f" ± {max(2 * std, 0.005):.2f}"
+    error = "" if np.isnan(size.extent_std) else f" ± {max(2 * size.extent_std, 0.005):.2f}"
+    least = "" if size.is_closed else "over "
     return [
         name,
         f"{size.extent_text}{error} {length}",
-        measure_text(size.area, area, digits=1),
+        least + measure_text(size.area, area, digits=1),
         height,
     ]
 
@@ -396,6 +410,8 @@ def _draw_room_text(axes: Axes, room: Room, lines: Sequence[str], taken: Sequenc
     cv2.fillPoly(free, [np.rint((corners - low) * per_mm).astype(np.int32)], 1)
     for part in (*(layout.on_page(hole) for hole in room.holes), *taken):
         cv2.fillPoly(free, [np.rint((part - low) * per_mm).astype(np.int32)], 0)
+    name = textwrap.wrap(lines[0], 24)
+    lines, titles = [*name, *lines[1:]], len(name)
     for count in (len(lines), 1):
         for points in _SIZES_PT:
             wide, high = _text_size_mm(lines[:count], points)
@@ -409,7 +425,7 @@ def _draw_room_text(axes: Axes, room: Room, lines: Sequence[str], taken: Sequenc
             step = 1.25 * points / _POINT
             for number, line in enumerate(lines[:count]):
                 place = y + ((count - 1) / 2 - number) * step
-                weight = "bold" if number == 0 else "normal"
+                weight = "bold" if number < titles else "normal"
                 axes.text(x, place, line, size=points, weight=weight, ha="center", va="center")
             return
 
@@ -440,7 +456,7 @@ def _draw_block(axes: Axes, storey: StoreySheet, settings: SheetSettings, layout
     _draw_frame(axes, layout.page_mm, settings.title, f"{kind}, {storey.title}", f"Scale {scale}")
     unit = "metres" if settings.is_metric else "scene units"
     notes = (
-        f"Clear lengths in {unit}; ± two standard deviations.",
+        f"Clear lengths in {unit}; ± two standard deviations. Widths of doors and windows are approximate.",
         f"Unit of length: {settings.source or 'not stated'}",
         "As in a mirror on the floor: left and right are those of the floor plan."
         if is_ceiling
@@ -466,11 +482,13 @@ def _draw_frame(axes: Axes, page_mm: tuple[float, float], *titles: str) -> None:
     axes.plot([x0, x1], [y0 + _BLOCK, y0 + _BLOCK], color=_INK, linewidth=0.35 * _POINT)
     left = _left_of_notes(width)
     axes.plot([left, left], [y0, y0 + _BLOCK], color=_INK, linewidth=0.2 * _POINT)
-    title = textwrap.wrap(titles[0], 26)[:2]
-    y = y0 + _BLOCK - 6
+    wide = left - x0 - 6
+    title = textwrap.wrap(titles[0], max(8, int(wide / 2.5))) or [""]
+    points = min(10.0, 30 / len(title))
+    y = y0 + _BLOCK - 3 - 0.2 * points
     for line in title:
-        axes.text(x0 + 3, y, line, size=10, weight="bold", va="center")
-        y -= 5.5
+        axes.text(x0 + 3, y, line, size=points, weight="bold", va="center")
+        y -= 0.55 * points
     for line in titles[1:]:
         axes.text(x0 + 3, y, line, size=7.5, va="center")
         y -= 4.5
@@ -545,13 +563,14 @@ def _tables(
         for room, (name, size) in enumerate(zip(storey.room_names, storey.plan.sizes, strict=True)):
             counts = storey.plan.opening_counts(room)
             volume = volume_of(size)
+            most = "" if size.is_rectangle or not size.is_closed else "max. "
             rows.append((
                 name,
-                ("" if size.is_rectangle else "max. ") + measure_text(size.length, length),
-                ("" if size.is_rectangle else "max. ") + measure_text(size.width, length),
-                "unknown" if np.isnan(size.height.value) else measure_text(size.height, length),
-                measure_text(size.area, area, digits=1),
-                "unknown" if np.isnan(volume.value) else measure_text(volume, length + "³", digits=1),
+                most + measure_text(size.length, length),
+                most + measure_text(size.width, length),
+                measure_text(size.height, length),
+                ("" if size.is_closed else "over ") + measure_text(size.area, area, digits=1),
+                measure_text(volume, length + "³", digits=1),
                 str(counts["door"]),
                 str(counts["window"]),
             ))  # fmt: skip

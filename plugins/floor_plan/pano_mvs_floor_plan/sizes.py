@@ -11,10 +11,11 @@ import numpy as np
 from pano_mvs.algorithms.points.plan_grid import Storey, levels
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs_floor_plan.evidence import PlanView
-from pano_mvs_floor_plan.rooms import Room, Side, contains
+from pano_mvs_floor_plan.rooms import Room, Side
 from pano_mvs_floor_plan.wall_lines import Line
 
 _NEAR_CELLS = 1.5
+_MOST_HEIGHTS = 200  # that are kept of a surface in a view
 _UPRIGHT, _FACING = 0.35, np.cos(np.deg2rad(25.0))  # of normals
 _PARALLEL = np.sin(np.deg2rad(3.0))
 
@@ -31,9 +32,10 @@ class RoomSize:
     """The clear sizes of a room.
 
     Attributes:
-        length: the longer extent along its walls.
-        width: the extent across.
+        length: the longer extent along its walls; NaN if it ends where nothing was seen.
+        width: the extent across, likewise.
         direction: (2,) unit vector of the length.
+        is_closed: whether walls were seen on all sides; otherwise area and perimeter are those of what was seen.
         is_rectangle: whether length and width are those of the whole room, not the largest ones.
         area: of the floor.
         perimeter: length of its outlines.
@@ -44,6 +46,7 @@ class RoomSize:
     length: Measure
     width: Measure
     direction: FloatArray
+    is_closed: bool
     is_rectangle: bool
     area: Measure
     perimeter: float
@@ -53,13 +56,22 @@ class RoomSize:
     @property
     def extent_text(self) -> str:
         """Length and width as text; the largest ones of a room that is not a rectangle are called so."""
-        most = "" if self.is_rectangle else "max. "
-        return f"{most}{self.length.value:.2f} × {self.width.value:.2f}"
+        most = "" if self.is_rectangle or not self.is_closed else "max. "
+        length, width = ("open" if np.isnan(one.value) else f"{one.value:.2f}" for one in (self.length, self.width))
+        return f"{most}{length} × {width}"
+
+    @property
+    def extent_std(self) -> float:
+        """The larger standard deviation of length and width; NaN if one is not known."""
+        stds = [one.std for one in (self.length, self.width) if not np.isnan(one.value)]
+        return float(np.max(stds)) if stds else float("nan")
 
 
 def volume_of(size: RoomSize) -> Measure:
-    """Return the volume below a level ceiling."""
+    """Return the volume below a level ceiling; NaN unless the room is closed."""
     area, height = size.area, size.height
+    if not size.is_closed:
+        return Measure(np.nan, np.nan)
     std = float(np.hypot(area.std * height.value, height.std * area.value))
     return Measure(area.value * height.value, std)
 
@@ -70,10 +82,16 @@ class SizeEvidence:
     Errors of ranges on a surface are alike, so that their mean is taken to be no better than one of them.
     """
 
-    def __init__(self, lines: Sequence[Line], rooms: Sequence[Room], *, cell: float) -> None:
-        """Start without views; `cell`: edge of a cell in which surfaces were looked for."""
-        self._lines, self._rooms, self._cell = lines, rooms, cell
-        self._stds: list[list[FloatArray]] = [[] for _ in lines]
+    def __init__(self, lines: Sequence[Line], rooms: Sequence[Room], sides: Sequence[Side], *, cell: float) -> None:
+        """Start without views; `sides`: of all rooms; `cell`: edge of a cell in which surfaces were looked for."""
+        self._lines, self._rooms, self._sides, self._cell = lines, rooms, sides, cell
+        # Where the sides on each line are, (2, 2) lower and upper corner.
+        self._boxes = {
+            number: _box(np.concatenate([side.ends for side in sides if side.line == number]))
+            for number in sorted({side.line for side in sides if side.line < len(lines)})
+        }
+        # Of each view that sees a line: the median of its standard deviations, and how many these are.
+        self._stds: list[list[tuple[float, int]]] = [[] for _ in lines]
         # (N, 2) each: heights and their standard deviations, of level surfaces that face up, and that face down
         self._floors: list[list[FloatArray]] = [[] for _ in rooms]
         self._ceilings: list[list[FloatArray]] = [[] for _ in rooms]
@@ -82,34 +100,42 @@ class SizeEvidence:
         """Add a view."""
         if not len(view.points):
             return
+        low, high = view.box()
         with np.errstate(invalid="ignore"):
             upright, level = np.abs(view.normals[:, 2]) < _UPRIGHT, np.abs(view.normals[:, 2]) > _FACING
         points, normals, errors = view.points[upright, :2], view.normals[upright, :2], view.point_errors[upright]
-        for line, stds in zip(self._lines, self._stds, strict=True):
+        for number, box in self._boxes.items():
+            if (box[1] < low).any() or (box[0] > high).any():
+                continue
+            line = self._lines[number]
             near = np.abs(points @ line.normal - line.offset) < _NEAR_CELLS * self._cell
             near &= normals @ line.normal > _FACING
-            stds.append(errors[near] * abs(float(view.center[:2] @ line.normal - line.offset)))
+            if near.any():
+                distance = abs(float(view.center[:2] @ line.normal - line.offset))
+                self._stds[number].append((_median(errors[near]) * distance, int(near.sum())))
         points, up = view.points[level], view.normals[level, 2] > 0
         above = points[:, 2] - view.center[2]
         heights = np.column_stack([points[:, 2], view.point_errors[level] * np.abs(above)])
         for room, floors, ceilings in zip(self._rooms, self._floors, self._ceilings, strict=True):
-            low, high = room.outline.min(axis=0), room.outline.max(axis=0)
-            inside = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1))
-            inside = inside[contains(room.outline, points[inside, :2])]
-            floors.append(heights[inside[up[inside] & (above[inside] < 0)]])
-            ceilings.append(heights[inside[~up[inside] & (above[inside] > 0)]])
+            lower, upper = _box(room.outline)
+            if (upper < low).any() or (lower > high).any():
+                continue
+            inside = np.flatnonzero(((points[:, :2] > lower) & (points[:, :2] < upper)).all(axis=1))
+            inside = inside[room.contains(points[inside, :2])]
+            for parts, chosen in (
+                (floors, inside[up[inside] & (above[inside] < 0)]),
+                (ceilings, inside[~up[inside] & (above[inside] > 0)]),
+            ):
+                parts.append(heights[chosen[:: 1 + len(chosen) // _MOST_HEIGHTS]])
 
-    def sizes(self, sides: Sequence[Side], *, storey: Storey) -> list[RoomSize]:
-        """Return the sizes of the rooms, with these sides in all.
-
-        Sides on further lines, the edges of what was looked at, are of unknown position.
-        """
-        stds = np.array([*(_median(np.concatenate([np.zeros(0), *parts])) for parts in self._stds), np.nan])
+    def sizes(self, *, storey: Storey) -> list[RoomSize]:
+        """Return the sizes of the rooms."""
+        stds = np.array([_weighted_median(parts) for parts in self._stds])
         step = max(storey.height, 1e-9) / 400
         return [
             _room_size(
                 room,
-                [side for side in sides if side.room == number],
+                [side for side in self._sides if side.room == number],
                 stds,
                 floor=_level(self._floors[number], step, highest=False),
                 ceiling=_level(self._ceilings[number], step, highest=True),
@@ -119,28 +145,30 @@ class SizeEvidence:
 
 
 def _room_size(room: Room, sides: Sequence[Side], stds: FloatArray, *, floor: Measure, ceiling: Measure) -> RoomSize:
-    own = stds[[min(side.line, len(stds) - 1) for side in sides]]
+    # Beyond the lines of walls are the edges of what was looked at.
+    is_wall = [side.line < len(stds) for side in sides]
+    own = np.array([stds[side.line] if wall else np.nan for side, wall in zip(sides, is_wall, strict=True)])
     ways = np.array([side.ends[1] - side.ends[0] for side in sides])
     lengths = np.linalg.norm(ways, axis=1)
     along = _main_direction(ways / lengths[:, None], lengths)
     across = np.array([-along[1], along[0]])
-    length, width = (_extent(room.outline, sides, own, direction=one) for one in (along, across))
-    if length.value < width.value:
-        along, length, width = across, width, length
+    if np.ptp(room.outline @ along) < np.ptp(room.outline @ across):
+        along, across = across, -along
+    whole = float(np.prod([np.ptp(room.outline @ one) for one in (along, across)]))
     # A wall that moves by its deviation adds its length times that to the area; pieces of one wall move together.
     by_line: dict[int, float] = {}
     for side, part, std in zip(sides, lengths, own, strict=True):
         by_line[side.line] = by_line.get(side.line, 0.0) + float(part * std)
-    whole = length.value * width.value
     return RoomSize(
-        length,
-        width,
-        along,
-        bool(len(room.outline) == 4 and not room.holes and abs(room.area - whole) < 0.01 * whole),
-        Measure(room.area, float(np.sqrt(sum(part**2 for part in by_line.values())))),
-        float(lengths.sum()),
-        Measure(ceiling.value - floor.value, float(np.hypot(floor.std, ceiling.std))),
-        _side_lengths(room.outline, sides, own),
+        length=_extent(room.outline, sides, own, direction=along, is_wall=is_wall),
+        width=_extent(room.outline, sides, own, direction=across, is_wall=is_wall),
+        direction=along,
+        is_closed=all(is_wall),
+        is_rectangle=bool(len(room.outline) == 4 and not room.holes and abs(room.area - whole) < 0.01 * whole),
+        area=Measure(room.area, float(np.sqrt(sum(part**2 for part in by_line.values())))),
+        perimeter=float(lengths.sum()),
+        height=Measure(ceiling.value - floor.value, float(np.hypot(floor.std, ceiling.std))),
+        sides=_side_lengths(room.outline, sides, own),
     )
 
 
@@ -163,12 +191,20 @@ def _main_direction(along: FloatArray, lengths: FloatArray) -> FloatArray:
     return np.asarray(along[best])
 
 
-def _extent(outline: FloatArray, sides: Sequence[Side], stds: FloatArray, *, direction: FloatArray) -> Measure:
-    """Return the extent of an outline along a direction."""
-    places = outline @ direction
+def _extent(
+    outline: FloatArray,
+    sides: Sequence[Side],
+    stds: FloatArray,
+    *,
+    direction: FloatArray,
+    is_wall: Sequence[bool],
+) -> Measure:
+    """Return the extent of an outline along a direction; NaN if it ends at an edge of what was looked at."""
     middles = np.array([side.ends.mean(axis=0) @ direction for side in sides])
-    low, high = float(stds[middles.argmin()]), float(stds[middles.argmax()])
-    return Measure(float(np.ptp(places)), float(np.hypot(low, high)))
+    ends = int(middles.argmin()), int(middles.argmax())
+    if not all(is_wall[end] for end in ends):
+        return Measure(np.nan, np.nan)
+    return Measure(float(np.ptp(outline @ direction)), float(np.hypot(*stds[list(ends)])))
 
 
 def _level(parts: Sequence[FloatArray], step: float, *, highest: bool) -> Measure:
@@ -179,6 +215,20 @@ def _level(parts: Sequence[FloatArray], step: float, *, highest: bool) -> Measur
         return Measure(np.nan, np.nan)
     value = found[-1 if highest else 0]
     return Measure(value, _median(heights[np.abs(heights[:, 0] - value) < 3 * step, 1]))
+
+
+def _box(xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return xy.min(axis=0), xy.max(axis=0)
+
+
+def _weighted_median(parts: Sequence[tuple[float, int]]) -> float:
+    """Return the median of values with weights, without NaN; NaN if there are none."""
+    known = sorted((value, weight) for value, weight in parts if np.isfinite(value))
+    if not known:
+        return np.nan
+    values, weights = np.array(known).T
+    sums = np.cumsum(weights)
+    return float(values[np.searchsorted(sums, sums[-1] / 2)])
 
 
 def _median(values: FloatArray) -> float:

@@ -56,6 +56,7 @@ Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 
 _EDGE_QUANTILE = 0.01
 _CEILING_CUT = 0.8  # of the storey's height, above which the plan of the ceiling shows it
+_LONGEST_NAME = 40
 _MARGIN = 0.03
 _MAX_SIDE_PX = 4096
 
@@ -88,11 +89,24 @@ class FloorPlanParams(Params):
     scale: int = Field(
         default=0, ge=0, le=100_000, description="denominator of the scale of sheets; 0: the largest scale that fits"
     )
-    title: str = Field(default="Floor plan", max_length=52, description="title of the sheets")
+    title: str = Field(default="Floor plan", min_length=1, max_length=60, description="title of the sheets")
     room_names: dict[str, str] = Field(
         default_factory=dict, description="names of rooms, by the name of an image that was taken in each"
     )
     min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
+
+    @field_validator("title")
+    @classmethod
+    def _is_text(cls, title: str) -> str:
+        return shown_text(title)
+
+    @field_validator("room_names")
+    @classmethod
+    def _are_names(cls, names: dict[str, str]) -> dict[str, str]:
+        for name in names.values():
+            if len(name) > _LONGEST_NAME:
+                raise ValueError(f"the name of a room has at most {_LONGEST_NAME} characters: {name}")
+        return {image: shown_text(name) for image, name in names.items()}
 
     @field_validator("formats")
     @classmethod
@@ -104,6 +118,17 @@ class FloorPlanParams(Params):
         return tuple(dict.fromkeys(formats))
 
 
+def shown_text(text: str) -> str:
+    """Return a text that drawings show, without spaces around it.
+
+    Raises:
+        ValueError: if it is empty or has characters that are not shown.
+    """
+    if not text.strip() or not text.isprintable():
+        raise ValueError(f"{text!r} must have letters, and no line breaks or control characters")
+    return text.strip()
+
+
 def plan_memory_bytes(params: FloorPlanParams, inputs: Mapping[str, Any]) -> int:
     """Return the memory for the grids of one storey, for what cameras see, parts of the cloud, and pictures of pages.
 
@@ -111,7 +136,7 @@ def plan_memory_bytes(params: FloorPlanParams, inputs: Mapping[str, Any]) -> int
     """
     return (
         500_000_000
-        + 500_000 * len(inputs["poses"].names)
+        + 900_000 * len(inputs["poses"].names)
         + 90 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
         + (page_bytes(params.paper) if params.sheets else 0)
     )
@@ -156,6 +181,8 @@ def floor_plan(
         storeys += len(about["storeys"])
         walls += sum(len(entry["walls"]) for entry in about["storeys"])
         rooms += sum(len(entry["rooms"]) for entry in about["storeys"])
+    for image in sorted(params.room_names.keys() - set(poses.names)):
+        ctx.note(f"room_names: there is no camera {image}")
     ctx.metric("storeys", storeys)
     ctx.metric("rooms", rooms)
     ctx.metric("walls", walls)
@@ -252,10 +279,11 @@ class _GroupPlan:
         """Write the sheets and the table of rooms of all storeys, and enter their names."""
         write_rooms_csv(self.folder / "rooms.csv", sheets, is_metric=self.poses.metric)
         has_north = self.poses.axes is WorldAxes.NORTH
-        if "ifc" in self.params.formats and self.poses.metric:
-            settings = BuildingSettings(
-                self.params.title, "/".join(sorted(self.poses.names)), has_north, self.poses.origin_lla
-            )
+        if "ifc" in self.params.formats and not any(sheet.plan.rooms for sheet in sheets):
+            self.notes.append("no plan.ifc: no room was found")
+        elif "ifc" in self.params.formats and self.poses.metric:
+            key = "/".join([self.params.title, *sorted(self.poses.names)])
+            settings = BuildingSettings(self.params.title, key, has_north=has_north, origin_lla=self.poses.origin_lla)
             write_ifc(self.folder / "plan.ifc", sheets, settings)
         elif "ifc" in self.params.formats:
             self.notes.append("no plan.ifc: lengths of a building are in metres, and the scale is not known")
@@ -263,8 +291,8 @@ class _GroupPlan:
             return
         sheet_settings = SheetSettings(
             self.params.title,
-            self.poses.metric,
-            self.poses.scale,
+            is_metric=self.poses.metric,
+            source=self.poses.scale,
             has_north=has_north,
             paper=self.params.paper,
             scale=self.params.scale,
@@ -318,7 +346,7 @@ class _GroupPlan:
             self.poses.metric,
         )
         files = self._write_files(f"storey_{number}", photo, drawing)
-        room_names = [self._room_name(idx, room, names) for idx, room in enumerate(plan.rooms)]
+        room_names = self._room_names(plan.rooms, names)
         sheet = StoreySheet(
             f"storey_{number}",
             f"storey {number}",
@@ -349,8 +377,9 @@ class _GroupPlan:
                     "area_std": _known(size.area.std),
                     "lengths": [side.value for side in size.sides],
                     "length_stds": [_known(side.std) for side in size.sides],
-                    "size": [size.length.value, size.width.value],
+                    "size": [_known(size.length.value), _known(size.width.value)],
                     "size_stds": [_known(size.length.std), _known(size.width.std)],
+                    "is_closed": size.is_closed,
                     "is_rectangle": size.is_rectangle,
                     "height": _known(size.height.value),
                     "height_std": _known(size.height.std),
@@ -381,12 +410,18 @@ class _GroupPlan:
             return []
         return [f"{size.area.value:.1f} m²", f"{size.extent_text} m"]
 
-    def _room_name(self, number: int, room: Room, cameras: Mapping[str, tuple[float, float]]) -> str:
-        """Return the name that the settings give a room by a panorama in it, or else its number."""
+    def _room_names(self, rooms: Sequence[Room], cameras: Mapping[str, tuple[float, float]]) -> list[str]:
+        """Return the names that the settings give rooms by panoramas in them, or else their numbers."""
+        names: dict[int, str] = {}
         for image, name in self.params.room_names.items():
-            if image in cameras and room.contains(np.array([cameras[image]]))[0]:
-                return name
-        return f"Room {number + 1}"
+            if image in cameras:
+                place = np.array([cameras[image]])
+                room = next((idx for idx, one in enumerate(rooms) if one.contains(place)[0]), None)
+                if room is None:
+                    self.notes.append(f"room_names: {image} is in no room that was found")
+                elif names.setdefault(room, name) != name:
+                    self.notes.append(f"room_names: {image} is in the room {names[room]}, which it would call {name}")
+        return [names.get(idx, f"Room {idx + 1}") for idx in range(len(rooms))]
 
     def _write_files(self, stem: str, photo: Orthophoto, drawing: PlanDrawing) -> dict[str, str]:
         """Write the files of a storey in all formats, and return their names."""

@@ -78,14 +78,28 @@ class WallBody:
     thickness: float | None
     rooms: tuple[int, ...]
 
-    def holds(self, opening: Opening) -> bool:
-        """Return whether an opening is in the wall."""
+    @property
+    def back(self) -> FloatArray:
+        """The direction (2,) from the side through the wall."""
+        way = (self.ends[1] - self.ends[0]) / np.linalg.norm(self.ends[1] - self.ends[0])
+        return np.array([way[1], -way[0]])
+
+    @property
+    def middle(self) -> FloatArray:
+        """The middle (2,) of the wall."""
+        return np.asarray(self.ends.mean(axis=0) + self.back * (self.thickness or 0.0) / 2)
+
+    def contains(self, xy: FloatArray) -> bool:
+        """Return whether a position (2,) is in the wall."""
+        return self.distance(xy) < _TOUCH
+
+    def distance(self, xy: FloatArray) -> float:
+        """Return how far a position (2,) is from the wall."""
         way = self.ends[1] - self.ends[0]
-        along = way / np.linalg.norm(way)
-        middle = opening.ends.mean(axis=0) - self.ends[0]
-        depth = float(middle @ (along[1], -along[0]))
-        thickness = self.thickness or 0.0
-        return bool(-_TOUCH < depth < thickness + _TOUCH and 0 <= middle @ along <= np.linalg.norm(way))
+        length = float(np.linalg.norm(way))
+        along, across = float((xy - self.ends[0]) @ way / length), float((xy - self.ends[0]) @ self.back)
+        beside = max(-along, along - length, 0.0), max(-across, across - (self.thickness or 0.0), 0.0)
+        return float(np.hypot(*beside))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +117,19 @@ class StoreyPlan:
         """Return how many doors and windows a room has."""
         return Counter(opening.kind for opening in self.openings if room in opening.rooms)
 
+    def openings_of(self, body: WallBody) -> list[Opening]:
+        """Return the openings in a wall, each of which is in the nearest one with as much known of its thickness."""
+        return [
+            opening
+            for opening in self.openings
+            if body
+            is min(
+                (one for one in self.bodies if (one.thickness is None) == (opening.thickness is None)),
+                key=lambda one: one.distance(opening.ends.mean(axis=0)),
+                default=None,
+            )
+        ]
+
 
 def plan_storey(
     evidence: Evidence,
@@ -115,7 +142,7 @@ def plan_storey(
     """Return the plan of a storey.
 
     `evidence`: what the views show. `known`: lines of known planes. `views`: gives the views of the evidence, and is
-    called three times. `cameras`: (N, 2) their positions. `min_share`: share of the height at which a wall must be
+    called up to four times. `cameras`: (N, 2) their positions. `min_share`: share of the height at which a wall must be
     seen.
     """
     evidence.recount(views())
@@ -125,7 +152,7 @@ def plan_storey(
     rooms, sides = find_rooms(evidence, lines, cells=cells, cameras=cameras)
     frames = [_Frame(side, evidence) for side in sides]
     thickest, least = 0.2 * evidence.storey.height, evidence.extent.pixel
-    measured = SizeEvidence(lines, rooms, cell=evidence.extent.pixel)
+    measured = SizeEvidence(lines, rooms, sides, cell=evidence.extent.pixel)
     for view in views():
         measured.add(view)
         for frame in frames:
@@ -161,35 +188,44 @@ def plan_storey(
             walls.append(Wall(frame.xy_of(start, end), frame.side.room, pieces[0][2] if pieces else None))
     bodies = _bodies(frames, hidden, lines=len(lines), least=least)
     doors = [(one.ends, one.thickness or 0.0) for one in openings if one.kind == "door"]
+    # An open leaf gives a line too, but no side of a room.
+    bounding = [lines[number] for number in sorted({side.line for side in sides if side.line < len(lines)})]
     leaves = iter(
-        door_leaves(doors, views(), lines=lines, storey=evidence.storey, cell=evidence.extent.pixel) if doors else ()
+        door_leaves(doors, views=views, lines=bounding, storey=evidence.storey, cell=evidence.extent.pixel)
+        if doors
+        else ()
     )
     openings = [replace(one, leaf=next(leaves)) if one.kind == "door" else one for one in openings]
-    return StoreyPlan(rooms, measured.sizes(sides, storey=evidence.storey), walls, openings, solids, bodies)
+    return StoreyPlan(rooms, measured.sizes(storey=evidence.storey), walls, openings, solids, bodies)
 
 
 def _bodies(
     frames: Sequence[_Frame], hidden: Sequence[Sequence[Behind]], *, lines: int, least: float
 ) -> list[WallBody]:
     """Return the walls with their openings, each once, those on the edges of the extent left out."""
-    bodies = []
+    known: list[WallBody] = []
     for idx, frame in enumerate(frames):
+        for other, first, last, depth in hidden[idx] if frame.side.line < lines else ():
+            first, last = max(first, 0.0), min(last, frame.length)
+            ends = frame.xy_of(*_to_corners(idx, first, last, frames=frames, hidden=hidden))
+            body = WallBody(ends, depth, (frame.side.room, frames[other].side.room))
+            # Both sides give the same wall, and the four sides of a pillar two.
+            if last - first > least and not any(one.contains(body.middle) for one in known):
+                known.append(body)
+    unknown = []
+    for frame, behind in zip(frames, hidden, strict=True):
         if frame.side.line >= lines:
             continue
-        covered = [0.0]
-        for other, first, last, depth in sorted(hidden[idx], key=lambda one: one[1]):
-            first, last = max(first, 0.0), min(last, frame.length)
-            covered += [first, last]
-            if last - first > least and (idx < other or all(one[0] != idx for one in hidden[other])):
-                ends = frame.xy_of(*_to_corners(idx, first, last, frames=frames, hidden=hidden))
-                bodies.append(WallBody(ends, depth, (frame.side.room, frames[other].side.room)))
-        covered.append(frame.length)
-        bodies += [
-            WallBody(frame.xy_of(start, end), None, (frame.side.room,))
-            for start, end in zip(np.maximum.accumulate(covered[::2]), covered[1::2], strict=True)
-            if end - start > least
-        ]
-    return bodies
+        edges = [0.0]
+        for _, first, last, _ in sorted(behind, key=lambda one: one[1]):
+            edges += [max(first, 0.0), min(last, frame.length)]
+        edges.append(frame.length)
+        for start, end in zip(np.maximum.accumulate(edges[::2]), edges[1::2], strict=True):
+            body = WallBody(frame.xy_of(start, end), None, (frame.side.room,))
+            # Where another wall meets the side from behind, this is the wall there.
+            if end - start > least and not any(one.contains(body.middle + least * frame.back) for one in known):
+                unknown.append(body)
+    return known + unknown
 
 
 def _to_corners(

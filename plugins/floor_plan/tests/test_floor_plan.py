@@ -153,8 +153,21 @@ def test_each_wall_has_one_body_with_its_openings(angle_deg: float) -> None:
     lengths = sorted(float(np.linalg.norm(body.ends[1] - body.ends[0])) for body in outer)
     assert lengths == pytest.approx([3, 3, 3, 3, 4, 4], abs=0.05)
     for opening in plan.openings:
-        (body,) = [one for one in plan.bodies if one.holds(opening)]
+        (body,) = [one for one in plan.bodies if any(each is opening for each in plan.openings_of(one))]
+        assert body.contains(opening.ends.mean(axis=0))
         assert (body is both) == (opening.kind == "door")
+
+
+def test_a_pillar_is_one_wall() -> None:
+    corners = np.array([[1.5, 1.2], [1.5, 1.65], [1.95, 1.65], [1.95, 1.2]])
+    panels = [(corners[idx - 1], corners[idx], 0.0, HEIGHT) for idx in range(4)]
+    places = np.array([(0.6, 0.6), (3.2, 2.4), (0.7, 2.4), (3.2, 0.7), (5.5, 1.0)])
+    cams = [camera(np.array([*place, 1.5])) for place in places]
+    views = [range_view(flat_ranges(cam, turn=np.eye(2), size_hw=(256, 512), more=panels), cam) for cam in cams]
+    plan = planned(views, np.array([(0.0, 0.0), (7.2, 3.0)]), places)
+    assert len(plan.rooms[0].holes) == 1
+    known = [body for body in plan.bodies if body.thickness is not None]
+    assert sorted(body.thickness or 0 for body in known) == pytest.approx([0.2, 0.45], abs=0.03)
 
 
 def test_a_window_does_not_reach_the_floor() -> None:

@@ -33,7 +33,8 @@ def rectangle(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
 
 def a_room(outline: FloatArray, area: float, *, height: float = 2.5) -> tuple[Room, RoomSize]:
     one = Measure(1.0, 0.01)
-    size = RoomSize(one, one, np.array([1.0, 0.0]), True, Measure(area, 0.1), 14.0, Measure(height, 0.02), [one] * 4)
+    size = RoomSize(one, one, np.array([1.0, 0.0]), is_closed=True, is_rectangle=True, area=Measure(area, 0.1),
+                    perimeter=14.0, height=Measure(height, 0.02), sides=[one] * 4)  # fmt: skip
     return Room(outline, [], area, outline.mean(axis=0)), size
 
 
@@ -98,15 +99,40 @@ def test_the_model_is_valid_and_holds_rooms_walls_and_openings(tmp_path: Path) -
     assert site.RefElevation == 12
 
 
-@pytest.mark.parametrize(("turn", "swing"), [(1.0, "SINGLE_SWING_LEFT"), (-1.0, "SINGLE_SWING_RIGHT")])
-def test_a_leaf_that_was_seen_has_its_swing(tmp_path: Path, turn: float, swing: str) -> None:
-    """Seen from the first room, the leaf opens into the second one, hinged on the left if that is +y."""
-    hinge, closed = ((1.9, 1.0) if turn > 0 else (1.0, 1.9)), 0.0
-    leaf = DoorLeaf(np.array([4.2, hinge[0]]), np.array([5.1, hinge[0]]), np.array([4.2 + closed, hinge[1]]))
+@pytest.mark.parametrize("into", [1.0, -1.0])
+@pytest.mark.parametrize("hinged_at", [1.0, 1.9])
+def test_a_leaf_that_was_seen_has_its_swing(tmp_path: Path, into: float, hinged_at: float) -> None:
+    """The leaf opens into the second room (+x) or the first one; who looks there has +y on the left or on the right."""
+    face = 4.1 + into * 0.1
+    hinge, other = np.array([face, hinged_at]), np.array([face, 2.9 - hinged_at])
+    leaf = DoorLeaf(hinge, hinge + np.array([into * 0.9, 0.0]), other)
     model = written(tmp_path, the_sheet(leaf=leaf))  # which must outlive what is read from it
     (door,) = model.by_type("IfcDoor")
-    assert door.OperationType == swing
+    is_left = (hinged_at > 1.5) == (into > 0)
+    assert door.OperationType == ("SINGLE_SWING_LEFT" if is_left else "SINGLE_SWING_RIGHT")
+    place = placement.get_local_placement(door.ObjectPlacement)
+    np.testing.assert_allclose(place[:3, 1], [into, 0, 0], atol=1e-6)  # the way through
+    np.testing.assert_allclose(place[:3, 3], [4.1, 1.9 if into > 0 else 1.0, 0.4], atol=1e-6)
     assert volume(door) == pytest.approx(0.9 * 2.0 * 0.04)
+    (between, _) = model.by_type("IfcWall")
+    assert volume(between) == pytest.approx(0.2 * (3 * 2.5 - 0.9 * 2.0), rel=1e-3)
+
+
+def test_a_wide_opening_without_a_leaf_is_a_passage(tmp_path: Path) -> None:
+    sheet = the_sheet()
+    wide = replace(sheet.plan.openings[0], ends=np.array([[4.1, 0.5], [4.1, 2.5]]))
+    model = written(tmp_path, replace(sheet, plan=replace(sheet.plan, openings=[wide])))
+    assert not model.by_type("IfcDoor")
+    (between, _) = model.by_type("IfcWall")
+    assert volume(between) == pytest.approx(0.2 * (3 * 2.5 - 2.0 * 2.0), rel=1e-3)
+
+
+def test_what_a_room_goes_around_is_not_in_its_space(tmp_path: Path) -> None:
+    sheet = the_sheet()
+    pillar = replace(sheet.plan.rooms[0], holes=[rectangle(1, 1, 1.5, 1.5)[::-1]])
+    model = written(tmp_path, replace(sheet, plan=replace(sheet.plan, rooms=[pillar, sheet.plan.rooms[1]])))
+    space = next(one for one in model.by_type("IfcSpace") if one.LongName == "Kitchen")
+    assert volume(space) == pytest.approx((12 - 0.25) * 2.5)
 
 
 def test_what_is_not_known_is_not_stated(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:
         np.array([[[0.5, 0.5], [3.5, 0.5]]]),
         [np.array([[0.5, 1.8], [1.5, 1.8], [1.5, 1.6], [0.5, 1.6]])],
         [("door", np.array([[2.5, 1.0], [3.0, 1.0]]))],
-        [room],
+        [room, DrawnRoom(np.zeros((0, 2)), ["1.0 m²"], np.array([3.2, 1.6]))],
         {"a.jpg": (2.0, 1.5)},
         ((0.0, 0.0), (4.0, 2.0)),
         1.0,
@@ -30,6 +30,7 @@ def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:
     assert picture[100, 275].tolist() == list(COLORS["door"])
     for rows in (slice(74, 86), slice(88, 100)):  # the area, and below it the size
         assert (picture[rows, 60:140].max(axis=-1) < 200).any()
+    assert (picture[10:40, 290:350].max(axis=-1) < 200).any()  # the area of the other room
     bar = np.flatnonzero(dark[200 + 18])
     longest = max(np.split(bar, np.flatnonzero(np.diff(bar) > 1) + 1), key=len)
     assert abs(len(longest) - 100) <= 3  # 1 m

@@ -100,7 +100,8 @@ def test_the_table_has_a_row_for_each_room(tmp_path: Path) -> None:
     files, _ = planned(tmp_path, sheets=())
     with files.files["floor_plan/rooms.csv"].open(newline="", encoding="utf-8") as stream:
         first, second = csv.DictReader(stream)
-    assert (first["storey"], first["room"], first["is_rectangle"]) == ("storey_0", "Room 1", "true")
+    assert (first["storey"], first["room"]) == ("storey_0", "Room 1")
+    assert (first["is_closed"], first["is_rectangle"]) == ("true", "true")
     for column, value in (("length_m", 4), ("width_m", 3), ("height_m", 2.6), ("area_m2", 12), ("perimeter_m", 14)):
         assert float(first[column]) == pytest.approx(value, rel=0.005)
     assert float(first["volume_m3"]) == pytest.approx(31.2, rel=0.01)
@@ -152,7 +153,7 @@ def test_without_a_unit_no_scale_is_stated(tmp_path: Path) -> None:
     assert "Scale not to scale: no length is known" in shown
     assert any(text.endswith(" units") for text in shown)
     assert not any(text.endswith((" m", " m²")) for text in shown)
-    assert "no scale is known" in ctx.notes[0]
+    assert ctx.notes == ["sheets are not at 1:50: no length is known"]
 
 
 @pytest.mark.parametrize("axes", [WorldAxes.LEVEL, WorldAxes.NORTH])
@@ -163,25 +164,89 @@ def test_north_is_shown_if_it_is_known(tmp_path: Path, axes: WorldAxes) -> None:
     assert ("unknown" in shown) == (axes is not WorldAxes.NORTH)
 
 
-def test_a_plan_that_is_turned_lies_along_the_paper(tmp_path: Path) -> None:
-    poses = flat_poses()
-    angle = np.deg2rad(25.0)
+def turned_flat(folder: Path, angle_deg: float, **settings: Any) -> Files:
+    """Return the plan of the two rooms in a world with north that is turned."""
+    poses, angle = flat_poses(), np.deg2rad(angle_deg)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     turned = Poses.without_points(
         {name: poses.cam_from_world(idx) @ Rigid3(turn.T, np.zeros(3)) for idx, name in enumerate(poses.names)},
-        frame="", scale="", metric=True, axes=WorldAxes.LEVEL,
+        frame="", scale="", metric=True, axes=WorldAxes.NORTH,
     )  # fmt: skip
     plan_from_world = Rigid3(WORLD_FROM_Z_UP.T @ turn.T, np.zeros(3))
     ranges = {
         name: flat_ranges(turned.cam_from_world(idx) @ plan_from_world.inverse(), turn=np.eye(2))
         for idx, name in enumerate(turned.names)
     }
-    params = FloorPlanParams(formats=("svg",), sheets=("png",))
-    ctx = Context(np.random.default_rng(0), tmp_path)
-    files = floor_plan(the_cloud(room_cloud(density=1)), turned, ranges, None, params, ctx)
+    params = FloorPlanParams.model_validate({"formats": ("svg",)} | settings)
+    ctx = Context(np.random.default_rng(0), folder)
+    return floor_plan(the_cloud(room_cloud(density=1)), turned, ranges, None, params, ctx)
+
+
+@pytest.mark.parametrize("angle_deg", [25.0, -35.0])
+def test_a_turned_plan_lies_along_the_paper_and_north_turns_with_it(tmp_path: Path, angle_deg: float) -> None:
+    files = turned_flat(tmp_path, angle_deg, sheets=("png", "svg"))
     wide, high = extent_mm(files)
     assert wide == pytest.approx(7200 / 50, abs=1.5)
     assert high == pytest.approx(3000 / 50, abs=1.5)
+    (storey,) = json.loads(files.files["floor_plan/floor_plan.json"].read_text())["storeys"]
+    way = np.diff(storey["rooms"][0]["outline"], axis=0)[0]
+    turn = (np.arctan2(way[1], way[0]) + np.pi / 4) % (np.pi / 2) - np.pi / 4  # of the walls, in the plan
+    assert abs(turn) == pytest.approx(np.deg2rad(abs(angle_deg)), abs=0.01)
+    svg = files.files["floor_plan/storey_0_sheet.svg"].read_text(encoding="utf-8")
+    (place,) = re.findall(r"<text([^>]*)>N</text>", svg)
+    x, y = (float(value) for value in re.findall(r"-?[\d.]+", place.split("rotate(")[1])[1:3])
+    # From the middle of the field of the north arrow, which is at the right end of the title block; in mm.
+    across, up = x * INCH / 72 - (297 - 8 - 11), 210 - y * INCH / 72 - (8 + 15 - 1.5)
+    assert np.arctan2(across, up) == pytest.approx(turn, abs=0.15)
+
+
+def test_the_plan_is_not_mirrored_and_the_ceiling_lies_over_it(tmp_path: Path) -> None:
+    """The notch of the L is in the upper right corner; the ceiling has a red patch in the lower right one."""
+    room = room_cloud(density=2000)
+    patch = (room.points[:, 2] > 2.5) & (room.points[:, 0] > 5) & (room.points[:, 1] < 1)
+    room = replace(room, colors=np.where(patch[:, None], np.array([220, 0, 0], np.uint8), room.colors))
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    params = FloorPlanParams(formats=("svg",), sheets=("png",))
+    files = floor_plan(the_cloud(room), the_poses((2, 2, 1.5)), None, None, params, ctx)
+    edge, block = round(12 / INCH * DPI), round(45 / INCH * DPI)
+    sheets = [
+        read_picture(files.files[f"floor_plan/storey_0_{kind}.png"])[edge:-block, edge:-edge].astype(int)
+        for kind in ("sheet", "ceiling_sheet")
+    ]
+    rows, columns = np.nonzero(sheets[0].max(axis=-1) < 100)
+    top, left, high, wide = rows.min(), columns.min(), np.ptp(rows), np.ptp(columns)
+
+    def dark_share(row: float, column: float) -> float:
+        y, x = round(top + row * high), round(left + column * wide)
+        return float((sheets[0][y - 6 : y + 7, x - 6 : x + 7].max(axis=-1) < 100).mean())
+
+    corners = {corner: dark_share(*corner) for corner in ((0, 0), (0, 1), (1, 0), (1, 1))}
+    assert corners[0, 1] == 0
+    assert min(share for corner, share in corners.items() if corner != (0, 1)) > 0.1
+    red = (sheets[1][..., 2] - sheets[1][..., 1] > 100) & (sheets[1][..., 2] > 150)  # walls are less red
+    rows, columns = np.nonzero(red)
+    assert (rows.mean() - top) / high == pytest.approx(4.5 / 5, abs=0.03)
+    assert (columns.mean() - left) / wide == pytest.approx(5.5 / 6, abs=0.03)
+
+
+def test_an_end_that_was_not_seen_is_open(tmp_path: Path) -> None:
+    """A corridor of 12 m whose last part no point shows."""
+    corridor = room_cloud(((0.0, 0.0), (12.0, 0.0), (12.0, 2.0), (0.0, 2.0)), table=False)
+    kept = corridor.points[:, 0] < 9
+    part = replace(corridor, **{name: getattr(corridor, name)[kept] for name in ("points", "normals", "colors")})
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    params = FloorPlanParams(formats=("svg",), sheets=("svg",))
+    files = floor_plan(the_cloud(part), the_poses((2, 1, 1.5), (6, 1, 1.5)), None, None, params, ctx)
+    (storey,) = json.loads(files.files["floor_plan/floor_plan.json"].read_text())["storeys"]
+    (room,) = storey["rooms"]
+    assert not room["is_closed"]
+    assert room["size"] == [None, pytest.approx(2.0, abs=0.05)]
+    shown = texts(files)
+    assert any(re.fullmatch(r"open × (1\.9|2\.0)\d m", text) for text in shown)
+    assert any(re.fullmatch(r"over 1\d\.\d m²", text) for text in shown)
+    with files.files["floor_plan/rooms.csv"].open(newline="", encoding="utf-8") as stream:
+        (row,) = csv.DictReader(stream)
+    assert (row["is_closed"], row["length_m"], row["volume_m3"]) == ("false", "", "")
 
 
 def test_any_name_is_text(tmp_path: Path) -> None:
@@ -189,6 +254,27 @@ def test_any_name_is_text(tmp_path: Path) -> None:
     files, _ = planned(tmp_path, sheets=("pdf", "svg", "png"), title="$5 _{ flat", room_names=names)
     shown = [html.unescape(text) for text in texts(files)]
     assert {"$5 _{ flat", *names.values()} <= set(shown)
+
+
+def test_names_that_nothing_shows_are_said(tmp_path: Path) -> None:
+    names = {"0.jpg": "Hall", "1.jpg": "Kitchen", "9.jpg": "Attic"}
+    files, ctx = planned(
+        tmp_path, sheets=("svg",), room_names=names, title="A house in a street with a long name, 1234"
+    )
+    assert ctx.notes == [
+        "room_names: 1.jpg is in the room Hall, which it would call Kitchen",
+        "room_names: there is no camera 9.jpg",
+    ]
+    shown = texts(files)
+    assert "1234" in " ".join(shown)  # of a title of several lines
+    for wrong in (
+        {"title": ""},
+        {"title": "a\nb"},
+        {"room_names": {"0.jpg": " "}},
+        {"room_names": {"0.jpg": "x" * 41}},
+    ):
+        with pytest.raises(ValueError, match=r"must have letters|at most 40|at least 1"):
+            FloorPlanParams.model_validate(wrong)
 
 
 def test_the_same_plan_gives_the_same_bytes(tmp_path: Path) -> None:

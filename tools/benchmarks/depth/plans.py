@@ -14,7 +14,8 @@ so that another run measures a change of the plan alone.
 * windows: the same of windows;
 * sizes: median and 95 % of the errors of length and width of the rooms that are found, and the share within twice
   their stated standard deviations; heights: the same of the heights of these rooms;
-* levels: median and 95 % of the errors of tops of openings and bottoms of windows;
+* levels: median and 95 % of the errors of tops of openings and bottoms of windows; widths: the same of the widths of
+  openings, of which doors have frames of 5 cm on each side;
 * leaves: open leaves of the doors that are drawn whose free ends are drawn within 30 cm, of all, and how many others.
 
 The walls of a house are those of the rooms in which a camera stands. Those of a capture are the places where its true
@@ -173,7 +174,9 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
             room = drawn["rooms"][number]
             lengths = sorted((x1 - x0, y1 - y0), reverse=True)
             sizes += [
-                (found - true, std) for found, true, std in zip(room["size"], lengths, room["size_stds"], strict=True)
+                (found - true, std)
+                for found, true, std in zip(room["size"], lengths, room["size_stds"], strict=True)
+                if found is not None
             ]
             if room["height"] is not None:
                 heights.append((room["height"] - true.height, room["height_std"]))
@@ -185,29 +188,37 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
         hit = [any(np.linalg.norm(one - other) < _NEAR for other in found) for one in every[: len(those)]]
         wrong = [not any(np.linalg.norm(one - other) < 2 * _NEAR for other in every) for one in found]
         openings[f"{kind}s"] = np.array([sum(hit), len(those), sum(wrong)])
-    return {
-        "found": np.isfinite(from_true),
-        "errors": to_true[np.isfinite(to_true)],
-        "false": ~np.isfinite(to_true),
-        "rooms": np.array([len(areas), len(true.rooms)]),
-        "areas": np.array(areas),
-        "sizes": np.array(sizes, np.float64).reshape(-1, 2),
-        "heights": np.array(heights, np.float64).reshape(-1, 2),
-        "leaves": _leaves(true, drawn),
-        "levels": _level_errors(true, drawn),
-    } | openings
+    return (
+        {
+            "found": np.isfinite(from_true),
+            "errors": to_true[np.isfinite(to_true)],
+            "false": ~np.isfinite(to_true),
+            "rooms": np.array([len(areas), len(true.rooms)]),
+            "areas": np.array(areas),
+            "sizes": np.array(sizes, np.float64).reshape(-1, 2),
+            "heights": np.array(heights, np.float64).reshape(-1, 2),
+            "leaves": _leaves(true, drawn),
+        }
+        | openings
+        | _opening_errors(true, drawn)
+    )
 
 
-def _level_errors(true: TrueStorey, drawn: dict[str, Any]) -> FloatArray:
-    """Return the errors of the tops of drawn openings, and of the bottoms of windows, where one is known."""
-    errors = []
-    middles = np.array([np.mean(ends, axis=0) for ends in (*true.doors, *true.windows)]).reshape(-1, 2)
+def _opening_errors(true: TrueStorey, drawn: dict[str, Any]) -> dict[str, FloatArray]:
+    """Return the errors of the tops of drawn openings and of the bottoms of windows, and of the widths of openings."""
+    levels, widths = [], []
+    ends = [*true.doors, *true.windows]
+    middles = np.array([np.mean(one, axis=0) for one in ends]).reshape(-1, 2)
     for opening in drawn.get("openings", []) if true.levels else ():
         away = np.linalg.norm(middles - np.mean(opening["ends"], axis=0), axis=1)
         if len(away) and away.min() < _NEAR:
-            bottom, top = true.levels[int(away.argmin())]
-            errors += [opening["top"] - top] + ([opening["bottom"] - bottom] if opening["kind"] == "window" else [])
-    return np.array(errors, np.float64)
+            nearest = int(away.argmin())
+            bottom, top = true.levels[nearest]
+            levels += [opening["top"] - top] + ([opening["bottom"] - bottom] if opening["kind"] == "window" else [])
+            widths.append(
+                float(np.linalg.norm(np.diff(opening["ends"], axis=0)) - np.linalg.norm(np.diff(ends[nearest], axis=0)))
+            )
+    return {"levels": np.array(levels, np.float64), "widths": np.array(widths, np.float64)}
 
 
 def _leaves(true: TrueStorey, drawn: dict[str, Any]) -> NDArray[np.int64]:
@@ -307,9 +318,12 @@ def figures(found: dict[str, NDArray[Any]]) -> tuple[str, ...]:
         f"{area:.1f} %",
         *("{} of {}, {} wrong".format(*found[kind]) for kind in ("doors", "windows", "leaves")),
         *(_errors_text(found[kind]) for kind in ("sizes", "heights")),
-        "{:.0f}, {:.0f} cm".format(*np.quantile(np.abs(found["levels"]), [0.5, 0.95]) * 100)
-        if len(found["levels"])
-        else "–",
+        *(
+            "{:.0f}, {:.0f} cm".format(*np.quantile(np.abs(found[kind]), [0.5, 0.95]) * 100)
+            if len(found[kind])
+            else "–"
+            for kind in ("levels", "widths")
+        ),
     )
 
 
@@ -341,4 +355,4 @@ def main() -> None:
         files = planned(capture, made, settings, folder=SCRATCH / "plans" / capture.name)
         rows.append((capture.name, *figures(measured(capture, files))))
     print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors", "windows", "leaves", "sizes",
-                 "heights", "levels"], rows)  # fmt: skip
+                 "heights", "levels", "widths"], rows)  # fmt: skip
