@@ -39,6 +39,7 @@ def views_of(scene: Scene, *, phantom: bool) -> list[PlaneView]:
     return views
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_mirror_is_found_where_the_frame_ends(seed: int) -> None:
     views = views_of(mirror_room(seed=seed, exposure=0.1), phantom=True)

@@ -104,6 +104,7 @@ def test_labels_change_where_colours_do(edge: int) -> None:
     np.testing.assert_array_equal(labels, np.broadcast_to(~first, size))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [256, 1000])
 def test_pictures_match_best_where_surfaces_are(rows: int) -> None:
     """Panoramas of 1000 rows are matched at 666, whose pixels are not those of the grid; ranges are exact at both."""

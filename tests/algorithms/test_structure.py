@@ -219,6 +219,7 @@ def _noisy_box(noise: float, darker: float | None) -> Box:
     return box
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grey", "count"), [pytest.param(True, 0, marks=pytest.mark.slow), (False, 1)], ids=["one grey", "clear creases"]
 )

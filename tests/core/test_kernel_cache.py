@@ -119,6 +119,7 @@ def test_copies_share_kernels_until_one_is_edited(tmp_path: Path, environment: d
     assert misses() == "1"
 
 
+@pytest.mark.slow
 def test_a_kernel_outside_the_package_is_compiled_again_after_an_edit(
     tmp_path: Path, environment: dict[str, str]
 ) -> None:

@@ -85,6 +85,7 @@ class Odd(SerialExecutor):
             super().cancel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how",
     [

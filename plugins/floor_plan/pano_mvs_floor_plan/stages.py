@@ -91,7 +91,7 @@ class FloorPlanParams(Params):
     )
     title: str = Field(default="Floor plan", min_length=1, max_length=60, description="title of the sheets")
     room_names: dict[str, str] = Field(
-        default_factory=dict, description="names of rooms, by the name of an image that was taken in each"
+        default={}, description="names of rooms, by the name of an image that was taken in each"
     )
     min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
 

@@ -93,6 +93,7 @@ def leaf_in_flat(*panels: Panel) -> DoorLeaf | None:
     return door.leaf
 
 
+@pytest.mark.slow
 def test_a_leaf_is_found_in_ranges_and_a_wardrobe_is_none() -> None:
     hinge, free = np.array([4.2, 1.8]), np.array([5.05, 1.8])
     leaf = leaf_in_flat((hinge, free, 0.0, 1.98))

@@ -130,6 +130,7 @@ def test_what_is_not_known_is_empty_or_unknown(tmp_path: Path) -> None:
     assert sides == pytest.approx([2, 2.5, 3, 3.5, 5, 6], abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "scale", "noted"),
     [
@@ -182,6 +183,7 @@ def turned_flat(folder: Path, angle_deg: float, **settings: Any) -> Files:
     return floor_plan(the_cloud(room_cloud(density=1)), turned, ranges, None, params, ctx)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle_deg", [25.0, -35.0])
 def test_a_turned_plan_lies_along_the_paper_and_north_turns_with_it(tmp_path: Path, angle_deg: float) -> None:
     files = turned_flat(tmp_path, angle_deg, sheets=("png", "svg"))
@@ -249,6 +251,7 @@ def test_an_end_that_was_not_seen_is_open(tmp_path: Path) -> None:
     assert (row["is_closed"], row["length_m"], row["volume_m3"]) == ("false", "", "")
 
 
+@pytest.mark.slow
 def test_any_name_is_text(tmp_path: Path) -> None:
     names = {"0.jpg": "$x^2$ & <b>", "2.jpg": "台所"}
     files, _ = planned(tmp_path, sheets=("pdf", "svg", "png"), title="$5 _{ flat", room_names=names)
@@ -277,6 +280,7 @@ def test_names_that_nothing_shows_are_said(tmp_path: Path) -> None:
             FloorPlanParams.model_validate(wrong)
 
 
+@pytest.mark.slow
 def test_the_same_plan_gives_the_same_bytes(tmp_path: Path) -> None:
     first, second = (planned(tmp_path / name, sheets=("pdf", "svg", "png"))[0] for name in "ab")
     for name, path in first.files.items():

@@ -35,6 +35,7 @@ def test_a_photograph_matches_where_the_panorama_shows_the_same(panorama: NDArra
     assert len(match_photograph(blank, found)) == 0
 
 
+@pytest.mark.slow
 def test_networks_of_colmap_match_photographs(
     panorama: NDArray[np.uint8], colmap: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

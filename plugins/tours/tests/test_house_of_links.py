@@ -114,6 +114,7 @@ def test_copies_at_one_position_have_a_house() -> None:
     assert np.isfinite(house.translations).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [pytest.param(0.0, marks=pytest.mark.slow), 300.0])
 def test_deviations_do_not_depend_on_the_origin_of_the_world(far: float) -> None:
     tour = made_tour()

@@ -89,6 +89,7 @@ def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:
     assert "none of the 5 items" in err
 
 
+@pytest.mark.slow
 @ON_POSIX
 @pytest.mark.parametrize(
     "number", ["SIGINT", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGTERM", "SIGHUP"))]

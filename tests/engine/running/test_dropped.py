@@ -296,6 +296,7 @@ def test_another_result_than_before_computes_what_reads_it(rows: Rows) -> None:
     assert rows.files() == fresh_files(rows, "last.value=6")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["serial", "processes"])
 def test_every_executor_drops_and_computes_again(rows: Rows, name: str) -> None:
     store = rows.store

@@ -151,6 +151,7 @@ def test_it_describes_what_an_editor_shows(schema: dict[str, Any]) -> None:
     assert {"census", "sad", "zncc"} <= set(cost["enum"])
 
 
+@pytest.mark.slow
 def test_stages_and_settings_of_a_workflows_plugins_and_of_what_it_extends_are_known(tmp_path: Path) -> None:
     (tmp_path / "plug.py").write_text(PLUGIN)
     (tmp_path / "helper.py").write_text(HELPER)

@@ -52,6 +52,7 @@ def test_a_camera_that_is_missing_or_cannot_be_judged_confirms_nothing() -> None
     assert not is_more_confirmed({0: np.nan}, {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 def test_a_camera_in_a_wrong_place_makes_an_arrangement_no_better(asked: Confirmation, seed: int) -> None:
     """Another source makes the maps of the others better, wherever it is: three right cameras lost against four."""
