@@ -452,8 +452,8 @@ def _draw_block(axes: Axes, storey: StoreySheet, settings: SheetSettings, layout
     """Draw the frame and the title block: what it is, its scale, unit and north, and what lines mean."""
     width, _ = layout.page_mm
     kind = "Reflected ceiling plan" if is_ceiling else "Floor plan"
-    scale = f"1:{layout.scale} on {settings.paper.upper()}" if layout.scale else "not to scale: no length is known"
-    _draw_frame(axes, layout.page_mm, settings.title, f"{kind}, {storey.title}", f"Scale {scale}")
+    scale = f"Scale 1:{layout.scale} on {settings.paper.upper()}" if layout.scale else "No scale: no length is known"
+    _draw_frame(axes, layout.page_mm, settings.title, f"{kind}, {storey.title}", scale)
     unit = "metres" if settings.is_metric else "scene units"
     notes = (
         f"Clear lengths in {unit}; ± two standard deviations. Widths of doors and windows are approximate.",

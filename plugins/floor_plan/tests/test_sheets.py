@@ -151,7 +151,7 @@ def test_a_scale_that_does_not_fit_is_replaced(
 def test_without_a_unit_no_scale_is_stated(tmp_path: Path) -> None:
     files, ctx = planned(tmp_path, flat_poses(metric=False), sheets=("svg",), scale=50)
     shown = texts(files)
-    assert "Scale not to scale: no length is known" in shown
+    assert "No scale: no length is known" in shown
     assert any(text.endswith(" units") for text in shown)
     assert not any(text.endswith((" m", " m²")) for text in shown)
     assert ctx.notes == ["sheets are not at 1:50: no length is known"]
