@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs_floor_plan.evidence import WallCells
+from pano_mvs_floor_plan.evidence import LAYERS, WallCells
 
 _ANGLE_BINS = 180
 # Cells belong to a line if they are this close, in cells, and their normals this similar.
@@ -41,19 +41,21 @@ class Line:
         return np.asarray(near & (cells.normals_xy @ self.normal >= _LEAST_COSINE))
 
 
-def wall_lines(cells: WallCells, known: Sequence[Line], *, min_area: float) -> list[Line]:
+def wall_lines(cells: WallCells, known: Sequence[Line], *, min_share: float, min_length: float) -> list[Line]:
     """Return the lines of walls, those that are known first.
 
-    `cells`: with vertical surfaces. `known`: lines of planes that others found. `min_area`: least area of the surfaces
-    on a line, in cells times layers.
+    `cells`: with vertical surfaces. `known`: lines of planes that others found. `min_share`: share of the layers at
+    which a wall must be seen, over a length along it of `min_length`. What is seen just below the ceiling alone is a
+    beam, however long.
     """
+    min_area = min_length / cells.cell * min_share * LAYERS
     found: list[Line] = []
     held: list[WallCells] = []
 
     def take(line: Line) -> None:
         nonlocal cells
         near = cells.only(line.holds(cells, within=_NEAR_CELLS))
-        if near.layers.sum() >= max(min_area, 1):
+        if near.layers.sum() >= max(min_area, 1) and _is_wall(line, near, min_share=min_share, min_length=min_length):
             found.append(line)
             held.append(near)
             cells = cells.only(~line.holds(cells, within=_TAKEN_CELLS))
@@ -69,6 +71,15 @@ def wall_lines(cells: WallCells, known: Sequence[Line], *, min_area: float) -> l
                 take(_fitted(line, cells))
                 cells = cells.only(~line.holds(cells, within=_TAKEN_CELLS))
     return _aligned(found, held)
+
+
+def _is_wall(line: Line, cells: WallCells, *, min_share: float, min_length: float) -> bool:
+    """Return whether a share of the layers has vertical surfaces over a length along a line, in three or more bins."""
+    bin_length = min_length / 3
+    _, inverse = np.unique(np.floor(cells.xy @ line.along / bin_length).astype(np.int64), return_inverse=True)
+    layers = np.zeros((int(inverse.max()) + 1, LAYERS), np.bool_)
+    np.logical_or.at(layers, inverse.reshape(-1), cells.layers)
+    return bool((layers.sum(axis=1) >= min_share * LAYERS).sum() >= 3)
 
 
 def _aligned(lines: Sequence[Line], held: Sequence[WallCells]) -> list[Line]:

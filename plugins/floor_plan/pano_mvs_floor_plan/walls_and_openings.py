@@ -11,7 +11,7 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs_floor_plan.door_leaves import DoorLeaf, door_leaves
-from pano_mvs_floor_plan.evidence import LAYERS, SURE, Evidence, PlanView
+from pano_mvs_floor_plan.evidence import SURE, Evidence, PlanView
 from pano_mvs_floor_plan.rooms import Room, Side, find_rooms
 from pano_mvs_floor_plan.sizes import RoomSize, SizeEvidence
 from pano_mvs_floor_plan.wall_lines import Line, wall_lines
@@ -147,8 +147,7 @@ def plan_storey(
     """
     evidence.recount(views())
     cells = evidence.wall_cells()
-    least = 0.15 * evidence.storey.height / cells.cell * min_share * LAYERS
-    lines = wall_lines(cells, known, min_area=least)
+    lines = wall_lines(cells, known, min_share=min_share, min_length=0.15 * evidence.storey.height)
     rooms, sides = find_rooms(evidence, lines, cells=cells, cameras=cameras)
     frames = [_Frame(side, evidence) for side in sides]
     thickest, least = 0.2 * evidence.storey.height, evidence.extent.pixel

@@ -170,6 +170,21 @@ def test_a_pillar_is_one_wall() -> None:
     assert sorted(body.thickness or 0 for body in known) == pytest.approx([0.2, 0.45], abs=0.03)
 
 
+def test_a_beam_below_the_ceiling_is_not_a_wall() -> None:
+    """Both sides of a beam of .3 m across the first room; the same down to the floor is a wall."""
+    places = np.array([(0.6, 1.0), (0.8, 2.4), (3.3, 2.4), (3.2, 0.7), (5.5, 1.0)])
+    cams = [camera(np.array([*place, 1.5])) for place in places]
+
+    def rooms(bottom: float) -> list[float]:
+        panels = [(np.array([x, 0.0]), np.array([x, 3.0]), bottom, HEIGHT) for x in (1.9, 2.1)]
+        views = [range_view(flat_ranges(cam, turn=np.eye(2), size_hw=(256, 512), more=panels), cam) for cam in cams]
+        plan = planned(views, np.array([(0.0, 0.0), (7.2, 3.0)]), places)
+        return sorted(room.area for room in plan.rooms)
+
+    assert rooms(HEIGHT - 0.3) == pytest.approx([9, 12], rel=0.02)
+    assert rooms(0.0) == pytest.approx([5.7, 5.7, 9], rel=0.03)
+
+
 def test_a_window_does_not_reach_the_floor() -> None:
     plan, _ = plan_of_flat(0.0)
     (window,) = [one for one in plan.openings if one.kind == "window"]
