@@ -548,7 +548,7 @@ def _draw_bar(axes: Axes, place: tuple[float, float], settings: SheetSettings, l
 
 
 _COLUMNS = ("room", "length", "width", "height", "area", "volume", "doors", "windows")
-_SHARES = (0.0, 0.26, 0.39, 0.52, 0.65, 0.77, 0.88, 0.94)
+_SHARES = (0.0, 0.235, 0.38, 0.525, 0.645, 0.77, 0.9, 0.95)
 _ROW_MM = 5.0
 
 
@@ -587,7 +587,7 @@ def _draw_table(
     for row in (_COLUMNS, *rows):
         weight = "bold" if row is _COLUMNS or len(row) == 1 else "normal"
         for text, share in zip(row, _SHARES, strict=False):
-            axes.text(left + share * width, y, text, size=6, weight=weight, va="center")
+            axes.text(left + share * width, y, text, size=5.5, weight=weight, va="center")
         y -= _ROW_MM
         if row is _COLUMNS:
             axes.plot([left, left + width], [y + 0.55 * _ROW_MM] * 2, color=_INK, linewidth=0.2 * _POINT)
