@@ -32,6 +32,8 @@ from pano_mvs.engine.executors.unit_requests import request_to_json
 from pano_mvs.engine.stages.stage_code import code_texts
 
 _CONNECT_S = 20.0
+# Without an address, the scheduler's web server asks for one port on all interfaces, which a second run finds taken.
+NO_DASHBOARD = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
 
 
 class DaskExecutor(Executor):
@@ -65,7 +67,7 @@ class DaskExecutor(Executor):
             # but after minutes of sleep dask takes them for lost, and nothing would start them again.
             with importlib.import_module("dask").config.set({"distributed.scheduler.worker-ttl": None}):
                 cluster = distributed.LocalCluster(
-                    n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
+                    n_workers=1, threads_per_worker=workers, processes=False, scheduler_kwargs=NO_DASHBOARD
                 )
             self._connect(store, cluster)
         try:

@@ -29,7 +29,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.executors.threads import WORKER_BYTES, share_cores
 from pano_mvs.engine.workflows.workflow_file import read_text
-from pano_mvs_queues.dask_cluster import DaskExecutor, with_waiting
+from pano_mvs_queues.dask_cluster import NO_DASHBOARD, DaskExecutor, with_waiting
 
 SYSTEMS = {"slurm": "sbatch", "pbs": "qsub", "lsf": "bsub", "sge": "qsub"}
 """Queueing system to its command that submits a job."""
@@ -223,7 +223,7 @@ class QueueExecutor(DaskExecutor):
             return kind(
                 job_cls=patient(kind.job_cls),
                 security=security,
-                scheduler_options={"dashboard_address": None, **options},
+                scheduler_options={**NO_DASHBOARD, **options},
                 **settings,
             )
         except (RuntimeError, ValueError, OSError) as error:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -93,6 +94,17 @@ def test_local_cluster_gives_the_bytes_of_serial(toy: Toy) -> None:
     assert files_below(toy.folder / "out-dask") == files_below(toy.folder / "out-serial")
     assert keys_and_outputs(toy.folder / "cache-dask") == keys_and_outputs(toy.folder / "cache-serial")
     assert not list((toy.folder / "cache-dask" / "tmp").iterdir())
+
+
+def test_two_clusters_run_side_by_side_in_silence(tmp_path: Path) -> None:
+    store = Store(tmp_path / "cache")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        first = DaskExecutor(store, workers=1, threads=1)
+        try:
+            DaskExecutor(store, workers=1, threads=1).close()
+        finally:
+            first.close()
 
 
 def test_temporary_results_are_dropped_and_computed_again(tmp_path: Path) -> None:
