@@ -48,6 +48,7 @@ from pano_mvs.io.point_selection import SelectedPoints as KeptPoints
 from pano_mvs.io.point_selection import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,
+    Ceilings,
     Features,
     FilePart,
     Files,
@@ -61,6 +62,8 @@ from pano_mvs.scene import (
     Poses,
     RangeMap,
     Record,
+    RoomLines,
+    RoomOutline,
     SceneLink,
     Scores,
     TwoView,
@@ -78,6 +81,7 @@ __all__ = [
     "NOT_IN_KEY",
     "All",
     "Axis",
+    "Ceilings",
     "Context",
     "CostWindow",
     "Each",
@@ -107,6 +111,8 @@ __all__ = [
     "Record",
     "RegisteredIn",
     "Rigid3",
+    "RoomLines",
+    "RoomOutline",
     "RunStoppedError",
     "SceneLink",
     "Scores",

@@ -8,11 +8,13 @@ from pano_mvs.scene.panorama import Panorama, SceneLink
 from pano_mvs.scene.poses import Pose, Poses, WorldAxes
 from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
+from pano_mvs.scene.rooms import Ceilings, RoomLines, RoomOutline
 from pano_mvs.scene.scores import Scores
 from pano_mvs.scene.two_view import Pairs, TwoView, TwoViews, Views
 
 __all__ = [
     "Axis",
+    "Ceilings",
     "Features",
     "FilePart",
     "Files",
@@ -28,6 +30,8 @@ __all__ = [
     "Poses",
     "RangeMap",
     "Record",
+    "RoomLines",
+    "RoomOutline",
     "SceneLink",
     "Scores",
     "TwoView",

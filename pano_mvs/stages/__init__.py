@@ -10,6 +10,7 @@ from pano_mvs.stages.exports.colmap_lenses import colmap_lenses
 from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
 from pano_mvs.stages.exports.mesh import mesh, mesh_textured
 from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
+from pano_mvs.stages.features_rooms import ceilings, room_lines, rooms
 from pano_mvs.stages.filters import (
     bilateral_solver,
     confidence,

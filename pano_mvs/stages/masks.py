@@ -84,7 +84,7 @@ def static(images: All[Panorama], params: StaticParams, ctx: Context) -> StaticM
         elif content.pixels.any():
             found[camera] = content.pixels
             ctx.note(f"{which}{share_of_sphere(content.pixels):.1%} of the sphere moves with the camera and is masked")
-    ctx.metric("masked", sum(len(cameras[camera]) for camera in found) / max(1, sum(map(len, cameras.values()))))
+    ctx.metric("images_masked", sum(len(cameras[camera]) for camera in found) / max(1, sum(map(len, cameras.values()))))
     masks = [_at_width(pixels) for pixels in found.values()]
     return StaticMasks(np.array(masks, np.uint8).reshape(-1, WIDTH // 2, WIDTH), tuple(found))
 

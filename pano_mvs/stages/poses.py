@@ -120,7 +120,7 @@ def verify(
         ctx.note(f"{shortened_list(moved)} {were} moved to another place, where the images confirm more of all cameras")
     for names in split_off:
         ctx.note(f"{shortened_list(names)} are a group of their own, since a camera that was left out held them")
-    return checked_poses(verified, ctx)
+    return reported_poses(verified, ctx) if only_links_place(verified, images) else checked_poses(verified, ctx)
 
 
 def changed_places(before: Poses, after: Poses) -> tuple[list[str], list[list[str]]]:
@@ -165,6 +165,8 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     source.dual_fisheye, the ray of each observation starts at the centre of its lens. If the distance of the lenses
     determines the unit of length to 3 %, the poses are in metres.
     """
+    if only_links_place(poses, images):
+        return reported_poses(poses, ctx)
     rigs = {name: image.rig for name, image in images.items() if image.rig is not None}
     refined = refine_poses(
         poses,
@@ -254,6 +256,13 @@ def triangulate(
     """Triangulate sparse points from known poses, which stay exactly as they are."""
     points = triangulate_tracks(poses, features, matches, **arguments_from(triangulate_tracks, params))
     return checked_poses(points, ctx)
+
+
+def only_links_place(poses: Poses, images: Mapping[str, Panorama]) -> bool:
+    """Return whether no two images are registered, but links of a virtual tour may say where they stand."""
+    return len(poses.names) < 2 and any(
+        link.direction_deg is not None for image in images.values() for link in image.links
+    )
 
 
 def checked_poses(poses: Poses, ctx: Context, *, remedy: str = CLOSER) -> Poses:

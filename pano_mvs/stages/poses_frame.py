@@ -20,6 +20,7 @@ from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import matched_positions
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.stages.pose_paths import PosesPath
+from pano_mvs.stages.poses import only_links_place
 
 
 def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
@@ -40,6 +41,8 @@ def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context
     `evidence` names a source of the vertical. Where cameras were turned in all directions, lines in the pictures give
     three axes, and brightness, texture and points show which one is vertical.
     """
+    if only_links_place(poses, images):
+        return poses
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
     for number, group in enumerate(groups):

@@ -17,6 +17,7 @@ from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM
 from pano_mvs.core.paths import exists
 from pano_mvs.geometry import Rigid3, pixel_from_ray, roll_panorama
 from pano_mvs.scene import (
+    Ceilings,
     Features,
     FilePart,
     GlobalDescriptor,
@@ -29,6 +30,8 @@ from pano_mvs.scene import (
     Poses,
     RangeMap,
     Record,
+    RoomLines,
+    RoomOutline,
     Scores,
     TwoView,
     Views,
@@ -38,6 +41,7 @@ from pano_mvs.scene.files import FaceFiles
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.panorama import StaticMasks, camera_of
 from pano_mvs.scene.photographs import Photographs
+from pano_mvs.scene.rooms import CEILINGS, OUTLINE_AZIMUTHS
 from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 
@@ -93,6 +97,8 @@ class TinyCapture:
             FaceFiles: {name: FaceFiles({}, size_px=12) for name in self.names},
             SurfaceSamples: {name: self._samples(idx) for idx, name in enumerate(self.names)},
             WeakImage: {name: WeakImage(wanted=True) for name in self.names},
+            RoomLines: dict.fromkeys(self.names, self._lines()),
+            RoomOutline: dict.fromkeys(self.names, self._outline()),
             TwoView: {pair: self._two_view(*pair) for pair in pairs.pairs},
         }
 
@@ -127,8 +133,20 @@ class TinyCapture:
             Structure: self._structure(),
             Scores: Scores({"registered": 1.0}, {}),
             House: self._house(),
+            Ceilings: frozen(Ceilings(np.exp(-((CEILINGS / 0.7 - 1) ** 2)).astype(np.float32))),
             Photographs: self._photographs(),
         }
+
+    def _lines(self) -> RoomLines:
+        """Return lines that show a ceiling, .7 camera heights above the cameras."""
+        return frozen(RoomLines(np.eye(3), 0.0, np.exp(-((CEILINGS / 0.7 - 1) ** 2)).astype(np.float32)))
+
+    def _outline(self) -> RoomOutline:
+        """Return a square room, whose walls are 1.5 camera heights away."""
+        azimuths = np.radians(np.arange(OUTLINE_AZIMUTHS))
+        distances = 1.5 / np.maximum(np.abs(np.sin(azimuths)), np.abs(np.cos(azimuths)))
+        right = np.full(OUTLINE_AZIMUTHS, 0.9, np.float32)
+        return frozen(RoomOutline(np.eye(3), 0.0, 0.7, distances.astype(np.float32), right))
 
     def _house(self) -> House:
         """Return the house of the capture, whose last camera only links place."""

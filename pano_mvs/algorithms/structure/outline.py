@@ -151,7 +151,7 @@ def _walls_of(one: Around, planes: Sequence[ScenePlane], turn: float) -> list[tu
     distance, clarity = np.concatenate([distance, known]), np.concatenate([clarity, known_clarity])
     label = best_walls(clarity, distance)
     found = []
-    for start, end in _pieces(label):
+    for start, end in pieces(label):
         azimuths = np.arange(start, end) % len(label)
         wall = int(label[azimuths[0]])
         if not 0 <= wall < searched:
@@ -189,7 +189,7 @@ def _confirmed(view: PlaneView, wall: ScenePlane, *, down: float, up: float) -> 
     return np.asarray(voted / np.maximum(area, 1e-12))
 
 
-def _pieces(label: Labels) -> list[tuple[int, int]]:
+def pieces(label: Labels) -> list[tuple[int, int]]:
     """Return the first azimuth of each run of equal labels, and the one after its last, which may be beyond the end."""
     starts = np.flatnonzero(label != np.roll(label, 1))
     if not len(starts):

@@ -298,6 +298,7 @@ class RunPass:
         )
         # the units that can run, and the results so far
         self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
+        self._stop: RunStoppedError | None = None
         self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
         self.stored = DroppedResults(run.temporary, run.graph, run.store, queue=self.queue)
 
@@ -349,6 +350,8 @@ class RunPass:
             if none_ready and not dispatcher:
                 if self.damaged:
                     raise DamagedBlobError(self.damaged[0])
+                if self._stop is not None:
+                    raise self._stop
                 return
             must_wait = none_ready or held is not None or not dispatcher.has_capacity
             finished = dispatcher.next_finished(WAIT_S if must_wait else 0)
@@ -409,7 +412,11 @@ class RunPass:
             self.damaged.append(outcome.cause)
             return
         if outcome.status == "stopped":
-            raise _STOPPING_ERRORS.get(outcome.error, PanoMvsError)(outcome.cause)
+            error = _STOPPING_ERRORS.get(outcome.error, PanoMvsError)(outcome.cause)
+            if not isinstance(error, RunStoppedError):
+                raise error
+            self._stop = self._stop or error  # what does not depend on this unit is still computed
+            return
         if outcome.record is not None:
             self._run.computed[unit.key] = unit.entry.name
             self._record(unit, outcome.record, was_computed=True)

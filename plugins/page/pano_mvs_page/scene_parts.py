@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.points.octree import octree
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, spiral_rays
-from pano_mvs.results.run_output import RunView
 from pano_mvs.scene import PointCloud
 from pano_mvs_page.encoding import (
     LogSteps,
@@ -192,10 +191,10 @@ def put_camera(
     page: PageFolder,
     idx: int,
     *,
-    view: RunView | None,
+    ranges: NDArray[np.float32] | None,
+    relative: NDArray[np.float32] | None,
     image: NDArray[np.uint8] | None,
     cam_from_page: Rigid3,
-    scale: float = 1.0,
     options: ShareOptions,
 ) -> dict[str, Any]:
     """Write the tiles, the ranges and their uncertainty of a panorama; return what the page needs to know of it.
@@ -203,22 +202,20 @@ def put_camera(
     Args:
         page: the page.
         idx: number of the panorama.
-        view: its ranges, if it has any.
+        ranges: `RANGES_HW` float32 in units of the page, if it has any.
+        relative: standard deviations of the ranges divided by the ranges, of the same size, if known.
         image: the panorama, if it could be read.
         cam_from_page: its pose.
-        scale: unit of its ranges in units of the page.
         options: of the page.
     """
     levels, tile_width = tile_layout(image.shape[1], options.max_width) if image is not None else (0, 0)
     if image is not None:
         for level, column, row, tile in panorama_tiles(image, levels, tile_width):
             page.put(f"panorama/{idx}/{level}-{column}-{row}", encode_jpeg(tile, options.jpeg_quality))
-    ranges = view.range_map if view is not None else None
-    text, low, high = encode_ranges(reduced(ranges) * np.float32(scale)) if ranges is not None else ("", 1.0, 2.0)
+    text, low, high = encode_ranges(ranges) if ranges is not None else ("", 1.0, 2.0)
     if text:
         page.put(f"panorama/{idx}/ranges", text)
-    relative = view.uncertainty if view is not None and text else None
-    sigmas = log_steps(reduced(relative), np.uint8) if relative is not None else None
+    sigmas = log_steps(relative, np.uint8) if relative is not None and text else None
     if sigmas is not None:
         page.put(f"panorama/{idx}/sigmas", encode_arrays(sigmas.steps))
     return {

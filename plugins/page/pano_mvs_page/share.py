@@ -28,6 +28,7 @@ from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 from pano_mvs_page.maps import run_plans
 from pano_mvs_page.mesh_file import thinned
+from pano_mvs_page.outlined import ROOM_UNCERTAINTY, room_map
 from pano_mvs_page.page_folder import PageFolder
 from pano_mvs_page.scene_parts import (
     RANGES_HW,
@@ -41,6 +42,8 @@ from pano_mvs_page.scene_parts import (
     shown_cloud,
 )
 from pano_mvs_page.shown import Shown, ShownCamera, shown_of
+
+_ROOM_WIDTH_PX = 2048  # of the pictures whose colours outlined rooms have
 
 
 def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:
@@ -120,9 +123,13 @@ def share_run(
     run, folder, options = run if isinstance(run, RunOutput) else load(run), Path(folder), options or ShareOptions()
     images = Path(images) if images is not None else None
     rooms = given_rooms(options.rooms) if options.rooms is not None else None
-    shown = shown_of(run, with_mesh=bool(options.max_triangles))
+    shown = shown_of(
+        run,
+        with_mesh=bool(options.max_triangles),
+        picture=lambda name: _image(run, name, images, max_width=_ROOM_WIDTH_PX),
+    )
     cloud, names = shown.cloud, tuple(camera.name for camera in shown.cameras)
-    if run.poses is None and (cloud is None or not len(cloud)):
+    if not names and (cloud is None or not len(cloud)):
         raise InputError(f"{run.out}: has neither a cloud nor cameras to show. Look at its report.html")
     if (cloud is None or not len(cloud)) and not any(_may_have_image(run, name, images) for name in names):
         raise InputError(
@@ -211,24 +218,38 @@ def _put_cameras(
     number = {camera.name: idx for idx, camera in enumerate(cameras)}
     for idx, one in enumerate(cameras):
         name = one.name
-        view = run.views.get(name) if one.scale is not None else None
+        ranges, relative = _ranges_of(run, one)
         image = _image(run, name, images, max_width=options.max_width)
         pose = one.cam_from_world @ frame.inverse()
         probability = run.summary.poses.p_right.get(name)
         judged = (
             {} if probability is None else {"right": share_text(probability), "color": probability_color(probability)}
         )
-        scale = 1.0 if one.scale is None else one.scale
-        camera = put_camera(page, idx, view=view, image=image, cam_from_page=pose, scale=scale, options=options)
+        camera = put_camera(
+            page, idx, ranges=ranges, relative=relative, image=image, cam_from_page=pose, options=options
+        )
         placed: dict[str, Any] = {"placed": one.placed} if one.placed else {}
         if one.leads_to is not None:
             placed["leadsTo"] = [number[target] for target in one.leads_to if target in number]
         described.append({"name": name, **judged, **placed, **camera})
-        if view is not None and view.range_map is not None:
-            sights[name] = Sight(pose, reduced(view.range_map) * np.float32(scale))
+        if ranges is not None and one.room is None:
+            sights[name] = Sight(pose, ranges)
         if progress is not None:
             progress(idx + 1, len(cameras))
     return described, sights
+
+
+def _ranges_of(run: RunOutput, camera: ShownCamera) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Return the ranges of a panorama in units of the page, at `RANGES_HW`, and their relative deviations, if known."""
+    view = run.views.get(camera.name) if camera.scale is not None else None
+    if view is not None and view.range_map is not None:
+        relative = view.uncertainty
+        ranges = reduced(view.range_map) * np.float32(camera.scale or 1.0)
+        return ranges, None if relative is None else reduced(relative)
+    if camera.room is None:
+        return None, None
+    ranges = room_map(camera.room, RANGES_HW, camera_height=camera.camera_height)
+    return ranges, np.full(RANGES_HW, ROOM_UNCERTAINTY, np.float32)
 
 
 def _image(run: RunOutput, name: str, images: Path | None, *, max_width: int) -> NDArray[np.uint8] | None:

@@ -16,8 +16,10 @@ from pano_mvs.cli.blocks_command import run_capture
 from pano_mvs.cli.commands import COMMANDS
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import has_scene, is_to_share, print_next
+from pano_mvs.core.errors import RunStoppedError
 from pano_mvs.core.paths import is_folder, resolved
 from pano_mvs.core.text import plural
+from pano_mvs.io.house_file import HOUSE_FILE
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.captures import is_early
@@ -77,11 +79,13 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
     folder = out.with_name(f"{out.name}_page")
     require_free(folder, "the page would be written to ")
     code = run_capture(session)
-    if is_early(code):
+    # Where matches join no two panoramas, the run stops, but links may have made a house of them.
+    is_house = code == RunStoppedError.exit_code and HOUSE_FILE in RunSummary.read(session.out).files
+    if is_early(code) and not is_house:
         console.say("no page is written. To continue, remove the cause and give the same command again")
         return code
     summary = RunSummary.read(session.out)
-    if not is_to_share(summary):
+    if not is_house and not is_to_share(summary):
         console.say("no page is written, because the run has neither a cloud nor ranges to show")
         return code
     share_output(session.out, folder, ShareOptions(), images=None, cache=session.store_root, console=console)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,10 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.house_file import HOUSE_FILE, read_house
 from pano_mvs.results.run_output import RunOutput
-from pano_mvs.scene import House, PlacedBy, PointCloud, Poses
+from pano_mvs.scene import House, PlacedBy, PointCloud, Poses, RoomOutline
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs_page.mesh_file import SharedMesh, joined_meshes, run_mesh
+from pano_mvs_page.outlined import room_cloud, room_mesh
 
 _PLACED = {
     PlacedBy.LINKS: "placed by links of the tour",
@@ -33,6 +34,8 @@ class ShownCamera:
     scale: float | None = 1.0  # unit of its ranges; None if these do not fit the place where it is shown
     placed: str = ""  # what says where it is, unless matches do
     leads_to: tuple[str, ...] | None = None  # panoramas to which links of a tour lead; None without them
+    room: RoomOutline | None = None  # the room around it, if it has no ranges
+    camera_height: float = 1.0  # above the floor of this room
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +51,18 @@ class Shown:
     notes: tuple[str, ...] = ()
 
 
-def shown_of(run: RunOutput, *, with_mesh: bool) -> Shown:
-    """Return what the page of a run shows, in the world of the largest group or in the frame of the house."""
+Picture = Callable[[str], NDArray[np.uint8] | None]
+
+
+def shown_of(run: RunOutput, *, with_mesh: bool, picture: Picture | None = None) -> Shown:
+    """Return what the page of a run shows, in the world of the largest group or in the frame of the house.
+
+    `picture`: returns a panorama (H, W, 3) by its name, if it can be read; it colours the room that it
+    outlines.
+    """
     house, note = _house_of(run)
     if house is not None:
-        return _whole_house(run, house, with_mesh=with_mesh)
+        return _whole_house(run, house, with_mesh=with_mesh, picture=picture or (lambda _: None))
     notes = [note]
     largest, *others = run.summary.poses.by_group()
     if others:
@@ -79,7 +89,7 @@ def _house_of(run: RunOutput) -> tuple[House | None, str]:
         return None, str(error)
 
 
-def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
+def _whole_house(run: RunOutput, house: House, *, with_mesh: bool, picture: Picture) -> Shown:
     groups = split_groups(run.poses) if run.poses is not None and run.poses.names else []
     clouds = run.cloud.groups() if run.cloud is not None else []
     shown_clouds, meshes, notes = list[PointCloud](), list[SharedMesh](), list[str]()
@@ -99,6 +109,21 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
                 inside = np.asarray(np.isin(nearest, cameras)[mesh.faces].all(axis=1))
                 if inside.any():
                     meshes.append(_some_faces(mesh, inside).moved(move))
+    rooms = _outlined_rooms(house)
+    for name, (room, height) in rooms.items():
+        image, pose = picture(name), house.cam_from_house(house.names.index(name))
+        if image is None:
+            continue
+        shown_clouds.append(room_cloud(room, image, pose, camera_height=height))
+        # A mesh hides the cloud, so that rooms have one only if the groups do.
+        if with_mesh and (meshes or not groups):
+            textured = not meshes or meshes[0].texture is not None
+            meshes.append(room_mesh(room, image, pose, camera_height=height, textured=textured))
+    if rooms:
+        notes.append(
+            f"{plural(len(rooms), 'a room', f'{len(rooms)} rooms')} without ranges {plural(len(rooms), 'is', 'are')} "
+            "drawn as the picture outlines them: floor, ceiling and walls, with furniture flat on them"
+        )
     count = sum(by == PlacedBy.LINKS for by in house.placed_by)
     notes.append(
         f"links of the tour say where {count} of {len(house.names)} panoramas {plural(count, 'is', 'are')}; their "
@@ -113,6 +138,7 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
             float(house.scales[idx]) if house.groups[idx] >= 0 else None,
             _PLACED.get(PlacedBy(house.placed_by[idx]), ""),
             house.links[idx],
+            *rooms.get(name, (None, 1.0)),
         )
         for idx, name in enumerate(house.names)
     ]
@@ -128,6 +154,15 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool) -> Shown:
         has_plan=False,
         notes=tuple(filter(None, notes)),
     )
+
+
+def _outlined_rooms(house: House) -> dict[str, tuple[RoomOutline, float]]:
+    """Return the rooms of single panoramas, which have no ranges, each with the height of its camera."""
+    height = house.camera_height
+    if height is None:
+        return {}
+    single = {name for name, group in zip(house.names, house.groups, strict=True) if group < 0}
+    return {name: (room, height) for name, room in house.rooms.items() if name in single}
 
 
 def _moves(group: Poses, house: House, number: int) -> list[tuple[int, Similarity3] | None]:

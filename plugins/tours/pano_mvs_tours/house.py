@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.api import All, Context, Files, One, Panorama, Poses, stage
+from pano_mvs.api import All, Context, Files, One, Panorama, Poses, RoomOutline, stage
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.io.house_file import HOUSE_FILE, house_document
 from pano_mvs.scene import House, PlacedBy
@@ -19,18 +19,20 @@ _WIDTH_PX = 1024  # of the pictures in which lines of walls are found
 
 
 @stage("house.links", memory="300MB")
-def links(poses: One[Poses], images: All[Panorama], ctx: Context) -> House:
+def links(poses: One[Poses], images: All[Panorama], rooms: All[RoomOutline] | None, ctx: Context) -> House:
     """Find where the groups of cameras and the single panoramas of a virtual tour stand in one house, by its links.
 
     Links in the tour's configuration say in which direction other scenes lie, and those that stand on the floor roughly
     how far away; walls at right angles say how each scene is turned. Such places are good enough for a plan and for
-    walking from room to room; they are not poses, and are not exported as such.
+    walking from room to room; they are not poses, and are not exported as such. The rooms of features.rooms, in heights
+    of the camera, belong to the house.
     """
     house = house_of_links(
         poses,
         {name: image.links for name, image in images.items()},
         {name: partial(_picture, image) for name, image in images.items()},
         up_in_cam={name: image.up_in_cam for name, image in images.items() if image.up_in_cam is not None},
+        rooms=rooms,
     )
     counts = Counter(house.placed_by)
     ctx.metric("by_links", counts[PlacedBy.LINKS])

@@ -13,7 +13,7 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segment
 from pano_mvs.algorithms.poses.joining.floors import height_over_points
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import UP, Rigid3, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
-from pano_mvs.scene import House, PlacedBy, Poses, SceneLink
+from pano_mvs.scene import House, PlacedBy, Poses, RoomOutline, SceneLink
 from pano_mvs.scene.pose_groups import split_groups, with_cameras
 from pano_mvs.scene.upright import mean_up_direction
 from pano_mvs_tours.layout import Place, layout
@@ -51,6 +51,7 @@ def house_of_links(
     pictures: Mapping[str, Picture],
     *,
     up_in_cam: Mapping[str, Sequence[float]] | None = None,
+    rooms: Mapping[str, RoomOutline] | None = None,
 ) -> House:
     """Return where all panoramas of a tour stand, in the frame and unit of the group of the largest part.
 
@@ -66,8 +67,12 @@ def house_of_links(
         links: image name to its links. If none joins two parts, no picture is loaded.
         pictures: image name to a function that loads it, of all panoramas in the capture's order.
         up_in_cam: direction away from gravity by sensors of cameras; others are taken to be level.
+        rooms: by image name; these say better how a camera is tilted, and how walls are turned.
     """
-    ups = up_in_cam or {}
+    rooms = {name: room for name, room in (rooms or {}).items() if room.ceiling is not None}
+    levels = {
+        name: rotation_from_two_vectors(np.asarray(up, np.float64), UP) for name, up in (up_in_cam or {}).items()
+    } | {name: room.cam_from_level.T for name, room in rooms.items()}
     groups = split_groups(poses) if poses.names else []
     is_tour = any(link.direction_deg is not None for own in links.values() for link in own)
     levelled = [
@@ -79,16 +84,16 @@ def house_of_links(
     grouped = {name for one in levelled for name in one.part.cameras}
     for name in pictures:
         if name not in grouped:
-            level = Rigid3(rotation_from_two_vectors(np.asarray(ups.get(name, UP), np.float64), UP), np.zeros(3))
+            level = Rigid3(levels.get(name, np.eye(3)), np.zeros(3))
             levelled.append(_Levelled(Part({name: level.inverse()}), Rigid3.identity(), 0.0, -1))
     parts = [one.part for one in levelled]
     between = any(link.parts[0] != link.parts[1] for link in part_links(parts, links))
     if between:
-        parts = [_with_walls(part, pictures) for part in parts]
+        parts = [_with_walls(part, pictures, rooms) for part in parts]
         places = layout(parts, part_links(parts, links), rng=np.random.default_rng(0))
     else:
         places = [Place(np.zeros(2), 0.0, _scale(part), 0.0, 0.0) for part in parts[:1]] + [None] * len(parts[1:])
-    return _house(levelled, places, links, order=tuple(pictures))
+    return _house(levelled, places, links, order=tuple(pictures)).with_rooms(rooms)
 
 
 def _certain(group: Poses) -> list[list[str]]:
@@ -126,7 +131,9 @@ def _of_group(group: Poses, number: int) -> _Levelled:
     )
 
 
-def _with_walls(part: Part, pictures: Mapping[str, Picture]) -> Part:
+def _with_walls(part: Part, pictures: Mapping[str, Picture], rooms: Mapping[str, RoomOutline]) -> Part:
+    if part.is_single and (room := rooms.get(next(iter(part.cameras)))) is not None:
+        return Part(part.cameras, part.height, room.wall_rad or 0.0)
     rotations = {name: camera.rotation for name, camera in part.cameras.items()}
     return Part(part.cameras, part.height, wall_azimuth(find_segments(pictures, rotations)))
 

@@ -93,7 +93,9 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
 
 
 def is_tour(folder: Path) -> bool:
-    """Return whether a folder holds two complete cubes or more, and no other panorama outside of its subfolders.
+    """Return whether a folder holds two scenes or more, and no other panorama outside of its subfolders.
+
+    Scenes are complete cubes, or panoramas that a configuration joins by links with directions.
 
     Raises:
         InputError: if the names of its files alone show these cubes, because its configuration cannot be read.
@@ -104,7 +106,11 @@ def is_tour(folder: Path) -> bool:
         return False
     cubes, unreadable = _cubes(capture, _TILES), list[str]()
     if len(cubes) < 2:
-        cubes = [dict(scene.tiles) for scene in _stated(capture, [], unreadable) if scene.tiles]
+        scenes = list(_stated(capture, [], unreadable))
+        joined = any(link.direction_deg is not None for scene in scenes for link in scene.links)
+        whole = [scene.panorama for scene in scenes if scene.panorama is not None and joined]
+        cubes = [dict(scene.tiles) for scene in scenes if scene.tiles]
+        cubes += [{("f", 0, 0): panorama} for panorama in whole]
     by_name = not cubes and bool(unreadable)
     if by_name:
         cubes = _cubes(capture, _TILES + _SIX_FILES)

@@ -45,7 +45,7 @@ def test_links_of_all_programs_place_scenes(tmp_path: Path, program: str) -> Non
     images = images_of(tmp_path, program)
     assert tuple(images) == NAMES
     context = Context(np.random.default_rng(0), tmp_path, 1)
-    house = links(poses_of(), images, context)
+    house = links(poses_of(), images, None, context)
     house.check()
     assert house.placed_by == ("links", "links", "nothing")
     # Both links are at 30° to the right, so that one scene is turned by 180° relative to the other.
@@ -59,7 +59,7 @@ def test_links_of_all_programs_place_scenes(tmp_path: Path, program: str) -> Non
 
 def test_the_file_says_where_panoramas_stand(tmp_path: Path) -> None:
     images = images_of(tmp_path, "Pannellum")
-    house = links(poses_of("Hall.png", "Bath.png"), images, Context(np.random.default_rng(0), tmp_path, 1))
+    house = links(poses_of("Hall.png", "Bath.png"), images, None, Context(np.random.default_rng(0), tmp_path, 1))
     assert house.placed_by == ("matches", "links", "matches")
     written = house_file(house, Context(np.random.default_rng(0), tmp_path, 1))
     assert list(written.files) == ["house.json"]
@@ -71,7 +71,7 @@ def test_the_file_says_where_panoramas_stand(tmp_path: Path) -> None:
 
 def test_without_links_there_is_no_file(tmp_path: Path) -> None:
     images = {name: replace(image, links=()) for name, image in images_of(tmp_path, "Pannellum").items()}
-    house = links(poses_of(*NAMES), images, Context(np.random.default_rng(0), tmp_path, 1))
+    house = links(poses_of(*NAMES), images, None, Context(np.random.default_rng(0), tmp_path, 1))
     assert house.placed_by == ("matches",) * 3
     assert not house_file(house, Context(np.random.default_rng(0), tmp_path, 1)).files
 

@@ -39,6 +39,7 @@ SIDES = 4
 # Search around the given up direction: half width, step and tolerance in degrees.
 _ROUNDS = ((20.0, 2.0, 3.0), (2.0, 0.5, 1.0), (0.5, 0.1, 0.5))
 _MIN_SEGMENTS = 20
+_WALL_ROUNDS_DEG, _DAMPING = (4.0, 2.0, 1.0, 0.5, 0.5), 0.02
 _CLEAR_WALLS = 1.5  # support of the directions of walls, relative to the median over all level directions
 
 
@@ -50,6 +51,10 @@ class Segments:
     weights: FloatArray  # (M,) lengths in radians
     # (M,) number of the view in which the segment was found; errors within a view are not independent
     groups: NDArray[np.int64]
+
+    def turned(self, rotation: FloatArray) -> Segments:
+        """Return the segments in a world that is turned by a rotation (3, 3)."""
+        return Segments(self.normals @ rotation.T, self.weights, self.groups)
 
     def nearly_vertical(self, up: FloatArray, *, groups: int) -> Segments:
         """Return the segments of the first groups that point to within 25° of `up` (3,)."""
@@ -185,6 +190,33 @@ def wall_azimuth(segments: Segments) -> float:
         return float("nan")
     fine = coarse[int(np.argmax(found))] + np.arange(-2.0, 2.01, 0.1)
     return float(np.deg2rad(fine[int(np.argmax(support(fine, _ROUNDS[1][2])))]) % (np.pi / 2))
+
+
+def turn_into_walls(segments: Segments, wall_rad: float) -> FloatArray:
+    """Return a small rotation (3, 3) that turns the vertical and both directions of walls onto the lines of a picture.
+
+    Lines along walls say as much about the vertical as vertical ones, of which a single picture shows few: tilts of
+    0.5° in 92 rendered panoramas were known to 0.05° in the median and to 0.1° in nine of ten.
+
+    Args:
+        segments: of all directions in a world that is level to some degrees, whose y points down.
+        wall_rad: azimuth of walls there, see `wall_azimuth`.
+    """
+    sine, cosine = np.sin(wall_rad), np.cos(wall_rad)
+    axes = np.array([UP, [sine, 0.0, cosine], [cosine, 0.0, -sine]])
+    rotation: FloatArray = np.eye(3)
+    for tolerance_deg in _WALL_ROUNDS_DEG:
+        turned = axes @ rotation.T
+        off = segments.normals @ turned.T
+        nearest = np.abs(off).argmin(axis=1)
+        residual = off[np.arange(len(nearest)), nearest]
+        share = residual / np.sin(np.deg2rad(tolerance_deg))
+        weight = segments.weights * np.where(np.abs(share) < 1, (1 - share**2) ** 2, 0.0)
+        change = np.cross(turned[nearest], segments.normals)  # of the residual, when the axes turn
+        matrix = (change * weight[:, None]).T @ change + _DAMPING * np.eye(3)
+        step = np.linalg.solve(matrix, -(change * weight[:, None]).T @ residual)
+        rotation = rotation_from_rotvec(step) @ rotation
+    return rotation
 
 
 def directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
