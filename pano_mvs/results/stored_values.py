@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
-from pano_mvs.core.paths import resolved
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
@@ -68,9 +68,14 @@ class StoredValues:
         last = summary.results.get("images")  # the source, or a stage that masks its images
         sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
         folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
+        read = {digest: Path(path) for path, digest in summary.inputs.items()}
         for name, ref in refs.get("images", {}).items() if folder else ():
-            path = summary.source_file(name, Path(str(folder)))
-            if path is not None and any(part.external for part in ref.parts.values()):
+            external = [part.digest for part in ref.parts.values() if part.external]
+            # A scene of a tour has a title, and its file another name.
+            path = summary.source_file(name, Path(str(folder))) or next(
+                (read[one] for one in external if one in read), None
+            )
+            if external and path is not None and is_file(path):
                 store.blobs.register_external(path)
         return StoredValues(store, refs)
 

@@ -10,7 +10,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.house_file import house_document, read_house
-from pano_mvs.scene import House
+from pano_mvs.scene import House, RoomOutline
 
 
 def house() -> House:
@@ -42,6 +42,44 @@ def test_a_house_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert np.allclose(again.translations, house().translations)
     assert again.center_stds.tolist() == [0.0, np.inf]
     assert np.allclose(again.turn_stds_rad, [0.0, 0.1])
+
+
+def room() -> RoomOutline:
+    distances = np.linspace(1.0, 2.0, 360).astype(np.float32)
+    distances[7] = np.nan
+    probabilities = np.where(np.isnan(distances), np.float32(np.nan), np.float32(0.75))
+    return RoomOutline(np.diag([1.0, -1.0, -1.0]), 0.3, 0.62, distances, probabilities)
+
+
+def test_rooms_are_read_as_they_were_written(tmp_path: Path) -> None:
+    file = tmp_path / "house.json"
+    nothing = RoomOutline.unknown()
+    with_rooms = house().with_rooms({"b": room(), "a": nothing, "gone": room()})
+    with_rooms.check()
+    file.write_text(json.dumps(house_document(with_rooms), allow_nan=False))
+    again = read_house(file).rooms
+    assert list(again) == ["b"]
+    assert again["b"].ceiling == 0.62
+    assert again["b"].wall_rad == pytest.approx(0.3, abs=1e-4)
+    assert np.array_equal(again["b"].cam_from_level, room().cam_from_level)
+    assert np.allclose(again["b"].distances, room().distances, atol=1e-4, equal_nan=True)
+    assert np.allclose(again["b"].probabilities, room().probabilities, equal_nan=True)
+    # Files of earlier versions say nothing of rooms.
+    document = house_document(house())
+    for row in document["panoramas"]:
+        del row["room"]
+    file.write_text(json.dumps(document))
+    assert read_house(file).rooms == {}
+
+
+@pytest.mark.parametrize("distances", [[1.0] * 3, [-1.0] * 360, ["far"] * 360])
+def test_a_room_that_cannot_be_is_refused_by_name(tmp_path: Path, distances: list[object]) -> None:
+    document = house_document(house().with_rooms({"b": room()}))
+    document["panoramas"][1]["room"]["distances"] = distances
+    file = tmp_path / "house.json"
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"house\.json"):
+        read_house(file)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,24 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
+from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, SceneLink, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene.pose_groups import join_groups
-from pano_mvs.stages.poses import ScaledTranslationParams, changed_places, scaled_translation, verify
+from pano_mvs.stages.poses import (
+    RefineParams,
+    ScaledTranslationParams,
+    changed_places,
+    refine,
+    scaled_translation,
+    verify,
+)
+from pano_mvs.stages.poses_frame import level
 from pano_mvs.stages.views import nearest
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
+LevelParams = Registry.installed().stages["poses.level"].params_type
 VerifyParams = Registry.installed().stages["poses.verify"].params_type
 NearestParams = Registry.installed().stages["views.nearest"].params_type
 
@@ -128,6 +138,17 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
     with pytest.raises(RunStoppedError, match=r"001\.png: no pair"):
         verify(poses=alone, images=tiny.each(Panorama), features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
+
+
+def test_a_tour_that_matches_do_not_join_goes_on_to_its_links(tiny: TinyCapture, ctx: Context) -> None:
+    alone = Poses.without_points({}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False)
+    linked = (SceneLink("000.png", (10.0, 0.0)),)
+    images = {name: replace(image, links=linked) for name, image in tiny.each(Panorama).items()}
+    checked = verify(poses=alone, images=images, features=None, matches=None, params=VerifyParams(), ctx=ctx)
+    refined = refine(poses=checked, images=images, params=RefineParams(), ctx=ctx)
+    assert level(poses=refined, images=images, params=LevelParams(), ctx=ctx).names == ()
+    assert ctx.rejected == {"001.png": "no pair"}
+    assert ctx.metrics["registered"] == 0.0
 
 
 def test_a_solver_that_places_nothing_leaves_it_to_the_next_stages_to_stop(tiny: TinyCapture, ctx: Context) -> None:

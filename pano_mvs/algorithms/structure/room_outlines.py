@@ -50,7 +50,11 @@ def lines_of(picture: Picture, valid: NDArray[np.bool_], up_in_cam: Sequence[flo
     wall = wall_azimuth(segments)
     if not np.isfinite(wall):
         return RoomLines(level_from_cam.T, None, np.zeros(0, np.float32))
-    level_from_cam = turn_into_walls(segments, wall).T @ level_from_cam
+    turn = turn_into_walls(segments, wall)
+    upright = rotation_from_two_vectors(turn @ UP, UP)
+    level_from_cam = upright @ level_from_cam
+    across = upright @ turn @ [np.sin(wall), 0.0, np.cos(wall)]
+    wall = float(np.arctan2(across[0], across[2]) % (np.pi / 2))
     around = skyline(blurred(picture), Rigid3(level_from_cam.T, np.zeros(3)), _TURN_STEP)
     return RoomLines(level_from_cam.T, wall, _ceiling_clarity(around, wall, CEILINGS).astype(np.float32))
 

@@ -17,8 +17,9 @@ _LEAST_PROBABILITY = 0.5
 _POINTS = 60_000
 _ROWS = 96  # of the mesh
 _TEXTURE_HW = (512, 1024)
-_BESIDE = 4  # azimuths that tell which direction a wall has
-_LEAST_COSINE, _MOST_CLOSED = 0.1, 135
+_WHOLE = 4  # azimuths of a wall that is no sliver, and that tell its direction
+_LEAST_COSINE = 0.1
+_FARTHER = 1.5  # walls that close a gap are at most as much farther than those beside it
 # Neighbours are on one surface if their ranges differ by less than this factor.
 _SAME_SURFACE = 1.25
 
@@ -26,35 +27,38 @@ _SAME_SURFACE = 1.25
 def closed_walls(room: RoomOutline) -> FloatArray:
     """Return the distance of the wall at each azimuth, (360,), NaN where none is near.
 
-    Walls that are probably wrong are left out. There, and where none is known, those on both sides go on to where they
-    meet, up to a right angle and a half away: an opening is closed by the wall that it is in.
+    Walls that are probably wrong are left out, as are slivers. There, the walls on both sides go on to where they meet:
+    an opening is closed by the wall that it is in.
     """
     known = np.where(room.probabilities >= _LEAST_PROBABILITY, room.distances, np.nan).astype(np.float64)
     count = len(known)
-    azimuths = np.arange(count) * 2 * np.pi / count
-    gap = np.isnan(known)
-    if room.wall_rad is None or gap.all() or not gap.any():
+    rows = np.arange(count)
+    finite = np.isfinite(known).astype(np.uint8)[None]
+    # Whether each azimuth is in a run of known ones that is long enough.
+    twice = cv2.morphologyEx(np.tile(finite, 3), cv2.MORPH_OPEN, np.ones((1, _WHOLE + 1), np.uint8))
+    inside = np.asarray(twice[0, count : 2 * count] > 0)
+    known[~inside] = np.nan
+    if room.wall_rad is None or inside.all() or not inside.any():
         return known
-    closed = known.copy()
+    directions = room.wall_rad + np.arange(4) * np.pi / 2
+    azimuths = rows * 2 * np.pi / count
+    cosines = np.cos(azimuths[:, None] - directions)
+    reached, farthest = np.full(count, np.inf), np.zeros(count)
     for step in (1, -1):
-        # From each gap, go back to the nearest known azimuth.
-        back = np.zeros(count, np.int64)
-        for _ in range(count):
-            back = np.where(np.isnan(known[(np.arange(count) - step * back) % count]), back + 1, back)
-        edge = (np.arange(count) - step * back) % count
-        beside = (edge[:, None] - step * np.arange(_BESIDE)) % count
-        directions = room.wall_rad + np.arange(4) * np.pi / 2
-        cosines = np.cos(azimuths[beside][..., None] - directions)
-        depths = known[beside][..., None] * cosines  # of the planes of four directions
-        spread = np.where((cosines > _LEAST_COSINE).all(axis=1), np.ptp(depths, axis=1), np.inf)
-        spread = np.where(np.isnan(spread), np.inf, spread)
+        places = np.arange(2 * count) * step  # twice around
+        last = np.maximum.accumulate(np.where(inside[places % count], np.arange(2 * count), -1))[count:]
+        edge = np.empty(count, np.int64)
+        edge[places[count:] % count] = (last * step) % count
+        beside = (edge[:, None] - step * np.arange(_WHOLE)) % count
+        depths = known[beside][..., None] * cosines[beside]  # of planes of the four directions
+        spread = np.where((cosines[beside] > _LEAST_COSINE).all(axis=1), np.ptp(depths, axis=1), np.inf)
         best = spread.argmin(axis=1)
-        rows = np.arange(count)
-        cosine = np.cos(azimuths - directions[best])
-        reaches = np.isfinite(spread[rows, best]) & (cosine > _LEAST_COSINE) & (back <= _MOST_CLOSED)
-        extended = np.where(reaches, depths[rows, 0, best] / np.where(reaches, cosine, 1.0), np.inf)
-        closed = np.where(gap, np.fmin(closed, extended), closed)
-    return np.where(np.isfinite(closed), closed, np.nan)
+        goes_on = cosines[rows, best] > _LEAST_COSINE
+        extended = depths[rows, 0, best] / np.where(goes_on, cosines[rows, best], 1.0)
+        reached = np.minimum(reached, np.where(goes_on, extended, np.inf))
+        farthest = np.maximum(farthest, known[edge])
+    closes = ~inside & (reached < _FARTHER * farthest)
+    return np.where(closes, reached, known)
 
 
 def room_ranges(room: RoomOutline, rays_in_cam: FloatArray, *, camera_height: float) -> FloatArray:

@@ -268,7 +268,9 @@ def _image(run: RunOutput, name: str, images: Path | None, *, max_width: int) ->
 
 
 def _may_have_image(run: RunOutput, name: str, images: Path | None) -> bool:
-    return (images is None and name in run.views) or run.summary.source_file(name, images) is not None
+    if images is None and (name in run.views or run.values.panorama(name) is not None):
+        return True
+    return run.summary.source_file(name, images) is not None
 
 
 _SAMPLED_HW = (16, 32)

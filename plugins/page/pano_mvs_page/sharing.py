@@ -16,7 +16,7 @@ from pano_mvs.cli.blocks_command import run_capture
 from pano_mvs.cli.commands import COMMANDS
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import has_scene, is_to_share, print_next
-from pano_mvs.core.errors import RunStoppedError
+from pano_mvs.core.errors import InputError, RunStoppedError
 from pano_mvs.core.paths import is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.io.house_file import HOUSE_FILE
@@ -79,8 +79,7 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
     folder = out.with_name(f"{out.name}_page")
     require_free(folder, "the page would be written to ")
     code = run_capture(session)
-    # Where matches join no two panoramas, the run stops, but links may have made a house of them.
-    is_house = code == RunStoppedError.exit_code and HOUSE_FILE in RunSummary.read(session.out).files
+    is_house = code == RunStoppedError.exit_code and _has_house(session.out)
     if is_early(code) and not is_house:
         console.say("no page is written. To continue, remove the cause and give the same command again")
         return code
@@ -95,6 +94,14 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
     if has_scene(summary) and "view" in COMMANDS.names():
         print_next([shlex.join(["pano-mvs", "view", str(session.out)])], console)
     return code
+
+
+def _has_house(out: Path) -> bool:
+    """Return whether links made a house of a run that stopped, because matches join no two of its panoramas."""
+    try:
+        return HOUSE_FILE in RunSummary.read(out).files
+    except InputError:
+        return False
 
 
 def open_in_browser(page: Path, *, environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:

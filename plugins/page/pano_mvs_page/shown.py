@@ -109,19 +109,20 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool, picture: Pict
                 inside = np.asarray(np.isin(nearest, cameras)[mesh.faces].all(axis=1))
                 if inside.any():
                     meshes.append(_some_faces(mesh, inside).moved(move))
-    rooms = _outlined_rooms(house)
+    rooms, drawn = _outlined_rooms(house), 0
     for name, (room, height) in rooms.items():
         image, pose = picture(name), house.cam_from_house(house.names.index(name))
         if image is None:
             continue
+        drawn += 1
         shown_clouds.append(room_cloud(room, image, pose, camera_height=height))
         # A mesh hides the cloud, so that rooms have one only if the groups do.
         if with_mesh and (meshes or not groups):
             textured = not meshes or meshes[0].texture is not None
             meshes.append(room_mesh(room, image, pose, camera_height=height, textured=textured))
-    if rooms:
+    if drawn:
         notes.append(
-            f"{plural(len(rooms), 'a room', f'{len(rooms)} rooms')} without ranges {plural(len(rooms), 'is', 'are')} "
+            f"{plural(drawn, 'a room', f'{drawn} rooms')} without ranges {plural(drawn, 'is', 'are')} "
             "drawn as the picture outlines them: floor, ceiling and walls, with furniture flat on them"
         )
     count = sum(by == PlacedBy.LINKS for by in house.placed_by)

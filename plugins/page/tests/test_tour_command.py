@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import webbrowser
 from pathlib import Path
@@ -9,10 +10,13 @@ from pathlib import Path
 import pytest
 from pano_mvs_page.sharing import open_in_browser
 
+from pano_mvs.io.house_file import read_house
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.session.session import Session
 from tests.cli.conftest import SMALL, Command
 from tests.engine.conftest import Toy
+from tests.synthetic.drawn_rooms import box
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +49,48 @@ def test_from_a_folder_to_the_page(pano_mvs: Command, capture: Path, opened: lis
     assert page.exists()
     assert len(opened) == 1
     assert f"open {page} in a browser" not in again.flat
+
+
+WORKFLOW = """\
+pano_mvs: 1
+name: rooms
+stages:
+  images: {use: source.folder, path: tour}
+  features: {use: features.sift_tangent, max_keypoints: 300}
+  pairs: {use: pairs.exhaustive}
+  matches: {use: matches.brute_force}
+  poses: {use: poses.scaled_translation}
+  verified: {use: poses.verify}
+  room_lines: {use: features.room_lines, only_linked: true}
+  ceilings: {use: features.ceilings}
+  rooms: {use: features.rooms}
+  house: {use: house.links}
+  house_file: {use: export.house}
+  views: {use: views.nearest}
+"""
+
+
+def test_a_tour_whose_rooms_matches_do_not_join_has_a_page(pano_mvs: Command, opened: list[str]) -> None:
+    """One panorama a room: links say where the rooms are, and each picture outlines its own."""
+    Path("tour").mkdir()
+    scenes = {}
+    for number, (other, yaw_deg) in enumerate(((1, 40.0), (0, -75.0))):
+        write_png(Path(f"tour/{number}.png"), box(25.0 + 20 * number, walls=(1.4, 2.2, 1.9 + number, 1.1)))
+        link = {"type": "scene", "sceneId": f"s{other}", "yaw": yaw_deg, "pitch": -15.0}
+        scenes[f"s{number}"] = {
+            "title": f"Room {number}", "type": "equirectangular", "panorama": f"{number}.png", "hotSpots": [link],
+        }  # fmt: skip
+    Path("tour/tour.json").write_text(json.dumps({"scenes": scenes}))
+    Path("rooms.yaml").write_text(WORKFLOW)
+    result = pano_mvs("tour", "tour", "--workflow", "rooms.yaml")
+    assert result.code == 4
+    assert "no two panoramas could be registered" in result.flat
+    assert "2 rooms without ranges are drawn as the picture outlines them" in result.flat
+    assert "2 panoramas" in result.flat
+    assert len(opened) == 1
+    house = read_house(Path("out/tour/house.json"))
+    assert house.placed_by == ("links", "links")
+    assert [round(room.ceiling or 0.0, 1) for room in house.rooms.values()] == [0.7, 0.7]
 
 
 @pytest.mark.parametrize(("name", "workflow"), [("rooms", "mesh"), ("walk.mp4", "walk")])

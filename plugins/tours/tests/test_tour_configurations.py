@@ -276,7 +276,9 @@ def test_our_own_exports_are_read(tmp_path: Path, file: str) -> None:
     assert [(scene.name, targets(scene)) for scene in scenes] == [("Room 0", ("Room 1",)), ("Room 1", ("Room 0",))]
     assert [link.direction_deg for scene in scenes for link in scene.links] == [pytest.approx((150.0, -20.0))] * 2
     assert [scene.panorama for scene in scenes] == [tmp_path / f"pictures/no {n}.jpg" for n in range(2)]
-    assert not is_tour(tmp_path), "source.folder reads panoramas without a change"
+    assert is_tour(tmp_path), "links say where scenes stand"
+    write(tmp_path / "another.jpg", np.tile(face_of("f"), (1, 2, 1)))
+    assert not is_tour(tmp_path), "no panorama is left out"
 
 
 HOSTILE = [

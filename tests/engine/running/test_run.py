@@ -208,6 +208,17 @@ def test_on_error_stop_and_gates_stop_with_exit_code_4(toy: Toy) -> None:
     assert "the stage reports: value" in toy.run("scaled.gate={valu: 1}").stopped
 
 
+def test_what_does_not_depend_on_a_stage_that_stops_the_run_is_computed(toy: Toy) -> None:
+    """Where matches join no two panoramas, the links of a tour still say where they stand."""
+    toy.begin(
+        'from pano_mvs.api import RunStoppedError\nraise RunStoppedError("nothing to show")', of="Consecutive pairs."
+    )
+    result = toy.run()
+    assert (result.exit_code, result.stopped) == (RunStoppedError.exit_code, "nothing to show")
+    assert sorted(result.published) == [f"mean/{number}.txt" for number in range(1, 6)]
+    assert not result.failures
+
+
 def test_empty_source_of_failures_only_is_an_input_error(toy: Toy) -> None:
     for number in range(1, 6):
         toy.number(f"{number}.txt", "not a number")

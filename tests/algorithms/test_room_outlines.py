@@ -1,0 +1,81 @@
+"""The room around a single panorama is outlined by its picture alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.frame.vertical_lines import find_segments, turn_into_walls
+from pano_mvs.algorithms.structure.room_outlines import ceilings_of, lines_of, outline_of
+from pano_mvs.geometry import UP, ray_grid, rotation_from_rotvec
+from pano_mvs.scene import RoomLines
+from pano_mvs.scene.rooms import OUTLINE_AZIMUTHS
+from tests.synthetic.drawn_rooms import COLORS, SIZE_HW, TILT, box, true_distances
+
+ALL = np.ones(SIZE_HW, np.bool_)
+
+
+def test_a_plain_room_is_outlined_in_heights_of_the_camera() -> None:
+    picture = box()
+    lines = lines_of(picture, ALL)
+    assert np.degrees(lines.wall_rad or 0.0) == pytest.approx(25.0, abs=0.3)
+    outline = outline_of(picture, lines, ceilings_of([lines]))
+    outline.check()
+    assert outline.ceiling == pytest.approx(0.7, rel=0.02)
+    off = np.abs(outline.distances / true_distances() - 1)
+    assert np.median(off) < 0.01
+    assert np.mean(off < 0.05) > 0.95
+    assert np.median(outline.probabilities) > 0.8
+
+
+def test_the_camera_is_levelled_by_the_lines_of_its_picture() -> None:
+    lines = lines_of(box(), ALL)
+    up = lines.cam_from_level @ UP
+    assert np.degrees(np.arccos(up @ (TILT @ UP))) < 0.2
+    # What a sensor says is where the search begins.
+    tilted = rotation_from_rotvec(np.radians([25.0, 0.0, 0.0]))
+    given = lines_of(box(cam_from_level=tilted), ALL, tuple(rotation_from_rotvec((0.02, 0, 0.01)) @ tilted @ UP))
+    assert np.degrees(np.arccos(given.cam_from_level @ UP @ (tilted @ UP))) < 0.2
+
+
+def test_lines_along_walls_say_how_a_camera_is_tilted() -> None:
+    segments = find_segments({"": lambda: (box(), ALL)}, {"": np.eye(3)})
+    turn = turn_into_walls(segments, np.radians(25.0))
+    assert np.degrees(np.arccos(turn @ UP @ (TILT @ UP))) < 0.2
+
+
+def test_a_picture_without_walls_has_no_outline() -> None:
+    shade = np.linspace(60, 200, SIZE_HW[0])[:, None, None]
+    picture = np.broadcast_to(shade, (*SIZE_HW, 3)).astype(np.uint8)
+    lines = lines_of(picture, ALL)
+    lines.check()
+    assert lines.wall_rad is None
+    outline = outline_of(picture, lines, ceilings_of([lines]))
+    outline.check()
+    assert outline.ceiling is None
+    assert np.isnan(outline.distances).all()
+
+
+def test_other_panoramas_say_how_high_the_ceiling_is() -> None:
+    """What is painted like the ceiling looks like a lower one; the other rooms of the house have none."""
+    clear, seen = box(), box().astype(np.float64)
+    rays = ray_grid(SIZE_HW) @ TILT
+    level = np.hypot(rays[..., 0], rays[..., 2])
+    azimuth = np.round(np.degrees(np.arctan2(rays[..., 0], rays[..., 2]))).astype(int) % OUTLINE_AZIMUTHS
+    height = -rays[..., 1] / level * true_distances()[azimuth]  # above the camera, on the walls
+    seen[(height > 0.45) & (height < 0.7)] = COLORS[1] - 10
+    picture = seen.round().astype(np.uint8)
+    own = lines_of(picture, ALL)
+    alone = outline_of(picture, own, ceilings_of([own]))
+    assert alone.ceiling == pytest.approx(0.45, rel=0.05)
+    others = [
+        lines_of(box(turn, walls=walls), ALL)
+        for turn, walls in ((10.0, (1.0, 2.0, 3.0, 1.3)), (60.0, (2.0, 1.0, 1.2, 2.5)))
+    ]
+    together = ceilings_of([own, *others])
+    assert outline_of(clear, lines_of(clear, ALL), together).ceiling == pytest.approx(0.7, rel=0.02)
+    assert outline_of(picture, own, together).ceiling == pytest.approx(0.7, rel=0.05)
+
+
+def test_nothing_is_said_of_a_capture_without_walls() -> None:
+    assert not ceilings_of([RoomLines.unknown()]).clarity.any()
