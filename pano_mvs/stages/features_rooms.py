@@ -43,7 +43,7 @@ def ceilings(lines: All[RoomLines]) -> Ceilings:
 def rooms(image: Each[Panorama], lines: Each[RoomLines], ceilings: One[Ceilings], ctx: Context) -> RoomOutline:
     """Find the outline of the room around a panorama, in heights of its camera above the floor.
 
-    One picture is enough, since the lines where walls meet floor and ceiling tell how far away they are. All panoramas
+    One picture is enough, since the lines where walls meet floor and ceiling show how far away they are. All panoramas
     of the capture say how high ceilings are. Openings, curved walls and walls at other angles are not known.
     """
     if lines.wall_rad is None:

@@ -1,7 +1,7 @@
 """Find the room around a single panorama, in heights of its camera, from its picture alone.
 
 The elevation of the crease of a wall with the floor gives its distance in heights of the camera, and that of its crease
-with the ceiling then gives the height of the ceiling. Panoramas of one capture mostly have the same, so that all vote:
+with the ceiling then gives the height of the ceiling. Panoramas of one capture mostly have the same, so that all count:
 a room and a smaller one of the same shape look alike in one picture, but not in several. Walls have four directions at
 right angles, which line segments show; `best_walls` selects one for each azimuth.
 """

@@ -17,7 +17,7 @@ _LEAST_PROBABILITY = 0.5
 _POINTS = 60_000
 _ROWS = 96  # of the mesh
 _TEXTURE_HW = (512, 1024)
-_WHOLE = 4  # azimuths of a wall that is no sliver, and that tell its direction
+_WHOLE = 4  # azimuths of a wall that is no sliver, and that show its direction
 _LEAST_COSINE = 0.1
 _FARTHER = 1.5  # walls that close a gap are at most as much farther than those beside it
 # Neighbours are on one surface if their ranges differ by less than this factor.
