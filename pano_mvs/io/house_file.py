@@ -86,13 +86,13 @@ def read_house(path: Path) -> House:
             center_stds=np.array([_number(row["center_std"]) for row in rows], np.float64),
             turn_stds_rad=np.deg2rad([_number(row["turn_std_deg"]) for row in rows]).astype(np.float64),
             links=tuple(tuple(map(str, row["links"])) for row in rows),
-            camera_height=document["camera_height"],
+            camera_height=None if document["camera_height"] is None else float(document["camera_height"]),
         ).with_rooms({str(row["name"]): _room(row["room"]) for row in rows if row.get("room") is not None})
         house.check()
         for name in (*house.names, *(target for targets in house.links for target in targets)):
             if problem := item_problem(name):
                 raise ValueError(problem)
-    except (KeyError, TypeError, ValueError, ContractError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, ContractError) as error:
         raise InputError(f"{path}: does not say where panoramas stand in a house ({error}). Run again") from error
     return house
 

@@ -71,11 +71,10 @@ class StoredValues:
         read = {digest: Path(path) for path, digest in summary.inputs.items()}
         for name, ref in refs.get("images", {}).items() if folder else ():
             external = [part.digest for part in ref.parts.values() if part.external]
-            # A scene of a tour has a title, and its file another name.
-            path = summary.source_file(name, Path(str(folder))) or next(
-                (read[one] for one in external if one in read), None
-            )
-            if external and path is not None and is_file(path):
+            # A scene of a tour has a title, which may be the name of the file of another scene.
+            path = next((read[one] for one in external if one in read and is_file(read[one])), None)
+            path = path or summary.source_file(name, Path(str(folder)))
+            if external and path is not None:
                 store.blobs.register_external(path)
         return StoredValues(store, refs)
 

@@ -130,7 +130,7 @@ class House(Record):
         require(bool((scales > 0).all()), self, "a scale is not positive")
         for name in ("center_stds", "turn_stds_rad"):
             require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
-        require(self.camera_height is None or self.camera_height > 0, self, "camera_height is not positive")
+        require(self.camera_height is None or 0 < self.camera_height < np.inf, self, "camera_height is not positive")
         rooms = len(self.room_names)
         require({*self.room_names} <= {*self.names}, self, "a room is of an image that is not listed")
         require(len({*self.room_names}) == rooms, self, "an image has two rooms")

@@ -20,7 +20,8 @@ class RoomLines(Record):
     """What the lines of a panorama say of the room around it.
 
     Attributes:
-        cam_from_level: (3, 3) rotation from a level frame, in which y points down and the camera looks along z.
+        cam_from_level: (3, 3) rotation from a level frame, whose y points down, turned as little as possible
+            against the camera: of one that stands upright, z is the direction of the picture's middle.
         wall_rad: azimuth of a wall in that frame, from z towards x, from 0 to π/2; None without walls at right angles.
         ceiling_clarity: (K,) float32 how clear the creases of walls are with the floor and with a ceiling at each of
             `CEILINGS`, from 0 to 2; empty without walls.
@@ -70,7 +71,8 @@ class RoomOutline(Record):
     seen through it.
 
     Attributes:
-        cam_from_level: (3, 3) rotation from a level frame, in which y points down and the camera looks along z.
+        cam_from_level: (3, 3) rotation from a level frame, whose y points down, turned as little as possible
+            against the camera: of one that stands upright, z is the direction of the picture's middle.
         wall_rad: azimuth of a wall in that frame, from z towards x; None if the outline is unknown.
         ceiling: height of the ceiling above the camera; None if the outline is unknown.
         distances: (360,) float32 level distance of the wall at each degree of azimuth, from z towards x; NaN where it
@@ -97,7 +99,15 @@ class RoomOutline(Record):
         require_array(self, "cam_from_level", dtype=np.float64, shape=(3, 3))
         for name in ("distances", "probabilities"):
             require_array(self, name, dtype=np.float32, shape=(OUTLINE_AZIMUTHS,), finite=False)
+        turn = self.cam_from_level
+        require(bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)), self, "cam_from_level is no rotation")
+        require(
+            (self.ceiling is None) == (self.wall_rad is None), self, "a ceiling without walls, or walls without one"
+        )
+        require(self.ceiling is None or 0 < self.ceiling < np.inf, self, "the ceiling is not above the camera")
         known = np.isfinite(self.distances)
         require(bool((self.distances[known] > 0).all()), self, "a distance is not positive")
-        require(bool((np.isfinite(self.probabilities) == known).all()), self, "distances and probabilities differ")
+        right = self.probabilities[known]
+        require(bool((np.isnan(self.probabilities) == ~known).all()), self, "distances and probabilities differ")
+        require(bool(((right >= 0) & (right <= 1)).all()), self, "a probability is not from 0 to 1")
         require(self.ceiling is not None or not known.any(), self, "distances without a ceiling")

@@ -32,7 +32,11 @@ def test_the_camera_is_levelled_by_the_lines_of_its_picture() -> None:
     lines = lines_of(box(), ALL)
     up = lines.cam_from_level @ UP
     assert np.degrees(np.arccos(up @ (TILT @ UP))) < 0.2
-    # What a sensor says is where the search begins.
+    # Without a sensor, up to 15° from the rows of the picture; what a sensor says is where the search begins.
+    for tilt_deg in (5.0, -14.0):
+        leaning = rotation_from_rotvec(np.radians([tilt_deg, 0.0, 2.0]))
+        lines = lines_of(box(cam_from_level=leaning), ALL)
+        assert np.degrees(np.arccos(lines.cam_from_level @ UP @ (leaning @ UP))) < 0.2
     tilted = rotation_from_rotvec(np.radians([25.0, 0.0, 0.0]))
     given = lines_of(box(cam_from_level=tilted), ALL, tuple(rotation_from_rotvec((0.02, 0, 0.01)) @ tilted @ UP))
     assert np.degrees(np.arccos(given.cam_from_level @ UP @ (tilted @ UP))) < 0.2
@@ -40,7 +44,8 @@ def test_the_camera_is_levelled_by_the_lines_of_its_picture() -> None:
 
 def test_lines_along_walls_say_how_a_camera_is_tilted() -> None:
     segments = find_segments({"": lambda: (box(), ALL)}, {"": np.eye(3)})
-    turn = turn_into_walls(segments, np.radians(25.0))
+    turn, weight = turn_into_walls(segments, np.radians(25.0))
+    assert 0 < weight <= segments.weights.sum()
     assert np.degrees(np.arccos(turn @ UP @ (TILT @ UP))) < 0.2
 
 

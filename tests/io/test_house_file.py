@@ -72,10 +72,19 @@ def test_rooms_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert read_house(file).rooms == {}
 
 
-@pytest.mark.parametrize("distances", [[1.0] * 3, [-1.0] * 360, ["far"] * 360])
-def test_a_room_that_cannot_be_is_refused_by_name(tmp_path: Path, distances: list[object]) -> None:
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("distances", value) for value in ([1.0] * 3, [-1.0] * 360, ["far"] * 360, [10**400] * 360)),
+        *(("ceiling", value) for value in (0.0, -0.5, 10**400, None, "high")),
+        *(("rotation", value) for value in ([[0.0] * 3] * 3, [[100.0, 0, 0], [0, 100, 0], [0, 0, 100]], 7)),
+        *(("probabilities", value) for value in ([-5.0] * 360, [0.5] * 3, [None] * 360)),
+        ("wall_deg", None),
+    ],
+)
+def test_a_room_that_cannot_be_is_refused_by_name(tmp_path: Path, field: str, value: object) -> None:
     document = house_document(house().with_rooms({"b": room()}))
-    document["panoramas"][1]["room"]["distances"] = distances
+    document["panoramas"][1]["room"][field] = value
     file = tmp_path / "house.json"
     file.write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"house\.json"):
@@ -88,6 +97,14 @@ def test_a_room_that_cannot_be_is_refused_by_name(tmp_path: Path, distances: lis
 def test_another_file_is_refused_by_name(tmp_path: Path, text: str) -> None:
     file = tmp_path / "house.json"
     file.write_text(text)
+    with pytest.raises(InputError, match=r"house\.json"):
+        read_house(file)
+
+
+@pytest.mark.parametrize("height", [10**400, 0, -1.0, "high", 1e999])
+def test_a_height_that_cannot_be_is_refused_by_name(tmp_path: Path, height: object) -> None:
+    file = tmp_path / "house.json"
+    file.write_text(json.dumps(house_document(house()) | {"camera_height": height}))
     with pytest.raises(InputError, match=r"house\.json"):
         read_house(file)
 

@@ -13,7 +13,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.vertical_lines import find_segments, turn_into_walls, wall_azimuth
+from pano_mvs.algorithms.poses.frame.vertical_lines import (
+    Segments,
+    directions_around,
+    find_segments,
+    turn_into_walls,
+    wall_azimuth,
+)
 from pano_mvs.algorithms.structure.outline import Labels, best_walls, pieces
 from pano_mvs.algorithms.structure.skyline import Skyline, clearest_total, skyline, wall_distances
 from pano_mvs.algorithms.structure.view import blurred
@@ -35,6 +41,10 @@ _MOVED, _MOVING_COST = np.linspace(0.94, 1.06, 13), 100.0
 # are right where it says 35, 50, 69 and 90 %.
 _ODDS, _OTHER_WALL = (-1.316, 2.315, 0.3425), 0.1
 
+# The vertical is searched within this tilt from several starts, each of which finds it within 3°. One that is farther
+# away must have more lines on the vertical and the walls by this factor.
+_TILT_DEG, _TILT_STEP_DEG, _BETTER = 15.0, 5.0, 1.1
+
 
 def lines_of(picture: Picture, valid: NDArray[np.bool_], up_in_cam: Sequence[float] | None = None) -> RoomLines:
     """Return what the lines of a panorama say of the room around it.
@@ -45,16 +55,10 @@ def lines_of(picture: Picture, valid: NDArray[np.bool_], up_in_cam: Sequence[flo
         up_in_cam: (3,) direction away from gravity, to some degrees; None: that of the picture's rows.
     """
     up = np.asarray(UP if up_in_cam is None else up_in_cam, np.float64)
-    level_from_cam = rotation_from_two_vectors(up, UP)
-    segments = find_segments({"": lambda: (picture, valid)}, {"": np.eye(3)}).turned(level_from_cam)
-    wall = wall_azimuth(segments)
-    if not np.isfinite(wall):
+    segments = find_segments({"": lambda: (picture, valid)}, {"": np.eye(3)})
+    level_from_cam, wall = _level_walls(segments, up)
+    if wall is None:
         return RoomLines(level_from_cam.T, None, np.zeros(0, np.float32))
-    turn = turn_into_walls(segments, wall)
-    upright = rotation_from_two_vectors(turn @ UP, UP)
-    level_from_cam = upright @ level_from_cam
-    across = upright @ turn @ [np.sin(wall), 0.0, np.cos(wall)]
-    wall = float(np.arctan2(across[0], across[2]) % (np.pi / 2))
     around = skyline(blurred(picture), Rigid3(level_from_cam.T, np.zeros(3)), _TURN_STEP)
     return RoomLines(level_from_cam.T, wall, _ceiling_clarity(around, wall, CEILINGS).astype(np.float32))
 
@@ -92,12 +96,34 @@ def outline_of(picture: Picture, lines: RoomLines, ceilings: Ceilings) -> RoomOu
     )
 
 
+def _level_walls(segments: Segments, up: FloatArray) -> tuple[FloatArray, float | None]:
+    """Return the rotation into a level frame near `up` (3,) in which lines are upright or along walls, and a wall."""
+    upright, wall, most = up, None, 0.0
+    starts = directions_around(up, _TILT_DEG, _TILT_STEP_DEG)
+    for start in starts[np.argsort(-(starts @ up), kind="stable")]:
+        near = rotation_from_two_vectors(start, UP)
+        turned = segments.turned(near)
+        azimuth = wall_azimuth(turned)
+        if not np.isfinite(azimuth):
+            continue
+        turn, weight = turn_into_walls(turned, azimuth)
+        if weight > _BETTER * most:
+            most, upright = weight, near.T @ turn @ UP
+            wall = near.T @ turn @ [np.sin(azimuth), 0.0, np.cos(azimuth)]
+    level_from_cam = rotation_from_two_vectors(upright, UP)
+    if wall is None:
+        return level_from_cam, None
+    across = level_from_cam @ wall
+    return level_from_cam, float(np.arctan2(across[0], across[2]) % (np.pi / 2))
+
+
 def _ceiling_clarity(around: Skyline, wall_rad: float, ceilings: FloatArray) -> FloatArray:
     """Return how clear the creases of walls are with the floor and with ceilings at some heights, (K,), from 0 to 2."""
     distance = wall_distances(around, wall_rad, _COARSE_DISTANCES)
     on_floor = around.crease_clarity(distance, -1.0)
     totals = [clearest_total(on_floor + around.crease_clarity(distance, height)) for height in ceilings.tolist()]
-    return np.asarray(totals, np.float64) / distance.shape[1]
+    result: FloatArray = np.array(totals) / distance.shape[1]
+    return result
 
 
 def _common_ceiling(lines: RoomLines, common: FloatArray) -> float:

@@ -318,7 +318,7 @@ class RunPass:
                 self._store.stat_cache.save()
             self._settle_all()
         except RunStoppedError as error:
-            stop = error
+            stop = self._stop or error
         finally:
             self._statistics.end_pass()
             self._statistics.put_in_order(
@@ -413,9 +413,11 @@ class RunPass:
             return
         if outcome.status == "stopped":
             error = _STOPPING_ERRORS.get(outcome.error, PanoMvsError)(outcome.cause)
-            if not isinstance(error, RunStoppedError):
+            if not isinstance(error, RunStoppedError) or self.queue.states[unit.entry.name].axis is not Axis.ONE:
                 raise error
-            self._stop = self._stop or error  # what does not depend on this unit is still computed
+            if self._stop is None:
+                self._run.warn(f"{unit.label} stops the run; what does not depend on it is still computed")
+            self._stop = self._stop or error
             return
         if outcome.record is not None:
             self._run.computed[unit.key] = unit.entry.name

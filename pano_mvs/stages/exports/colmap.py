@@ -69,6 +69,9 @@ def colmap(
     metres, colmap_rig/sparse/0 … are the same models with a rig of two OPENCV_FISHEYE cameras instead, whose pictures
     export.colmap_lenses writes.
     """
+    if not poses.names:
+        ctx.note("no model for COLMAP: no image is registered")
+        return Files({})
     panoramic = _sparse_models(poses, images, params.format, photographs=photographs, ctx=ctx, target="colmap/sparse")
     return Files({**panoramic.files, **lens_rig_files(poses, images, params.format, ctx=ctx)})
 

@@ -101,7 +101,7 @@ def coarser(mesh: SharedMesh, max_faces: int) -> SharedMesh | None:
 
 
 def joined_meshes(meshes: Sequence[SharedMesh]) -> SharedMesh | None:
-    """Return several meshes as one, their textures below one another; those without are left out if any has one."""
+    """Return several meshes as one, their textures in rows; those without are left out if any has one."""
     textured = [mesh for mesh in meshes if mesh.texture is not None and mesh.uv is not None]
     used = textured or [mesh for mesh in meshes if mesh.colors_rgb is not None]
     if len(used) < 2:
@@ -113,16 +113,32 @@ def joined_meshes(meshes: Sequence[SharedMesh]) -> SharedMesh | None:
         colors = [mesh.colors_rgb for mesh in used if mesh.colors_rgb is not None]
         return SharedMesh(vertices, faces, np.concatenate(colors))
     textures = [mesh.texture for mesh in used if mesh.texture is not None]
-    width, height = max(one.shape[1] for one in textures), sum(one.shape[0] for one in textures)
-    atlas, top, places = np.zeros((height, width, 3), np.uint8), 0, []
-    for mesh, texture in zip(used, textures, strict=True):
+    corners, (height, width) = _in_rows([(one.shape[0], one.shape[1]) for one in textures])
+    atlas, places = np.zeros((height, width, 3), np.uint8), []
+    for mesh, texture, (top, left) in zip(used, textures, corners, strict=True):
         assert mesh.uv is not None
         rows, columns = texture.shape[:2]
-        atlas[top : top + rows, :columns] = texture
+        atlas[top : top + rows, left : left + columns] = texture
         bottom = height - top - rows  # places count from the lower-left corner
-        places.append(mesh.uv * [columns / width, rows / height] + [0, bottom / height])
-        top += rows
+        places.append(mesh.uv * [columns / width, rows / height] + [left / width, bottom / height])
     return SharedMesh(vertices, faces, uv=np.concatenate(places).astype(np.float32), texture=atlas)
+
+
+def _in_rows(sizes_hw: Sequence[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Return the upper-left corner (top, left) of each rectangle in rows, in their order, and the size of all.
+
+    All together are about as wide as high.
+    """
+    area = sum(height * width for height, width in sizes_hw)
+    most = max(*(width for _, width in sizes_hw), round(area**0.5))
+    corners, top, left, row = [], 0, 0, 0
+    for height, width in sizes_hw:
+        if left + width > most:
+            top, left, row = top + row, 0, 0
+        corners.append((top, left))
+        left, row = left + width, max(row, height)
+    used = max(start + width for (_, start), (_, width) in zip(corners, sizes_hw, strict=True))
+    return corners, (top + row, used)
 
 
 def _colored(run: RunOutput, name: str) -> SharedMesh:

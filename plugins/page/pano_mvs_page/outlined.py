@@ -13,10 +13,13 @@ from pano_mvs_page.mesh_file import SharedMesh
 
 ROOM_UNCERTAINTY = 0.05
 """Relative standard deviation of ranges on walls that pictures outline; see `RoomOutline.probabilities`."""
+CLOSED_UNCERTAINTY = 0.2
+"""The same where walls beside them close a gap."""
 _LEAST_PROBABILITY = 0.5
 _POINTS = 60_000
-_ROWS = 96  # of the mesh
+_ROWS = 96  # of the mesh of a room; fewer if there are many
 _TEXTURE_HW = (512, 1024)
+_ALL_TRIANGLES, _ALL_TEXELS = 400_000, 8_000_000  # of the rooms together
 _WHOLE = 4  # azimuths of a wall that is no sliver, and that show its direction
 _LEAST_COSINE = 0.1
 _FARTHER = 1.5  # walls that close a gap are at most as much farther than those beside it
@@ -109,9 +112,14 @@ def room_mesh(
     *,
     camera_height: float,
     textured: bool,
+    count: int = 1,
 ) -> SharedMesh:
-    """Return floor, ceiling and walls as a mesh, with the panorama (H, W, 3) as its texture or as colours."""
-    rows, columns = _ROWS, 2 * _ROWS
+    """Return floor, ceiling and walls as a mesh, with the panorama (H, W, 3) as its texture or as colours.
+
+    `count`: number of rooms of the page, of which many are coarser.
+    """
+    rows = min(_ROWS, max(24, int(np.sqrt(_ALL_TRIANGLES / count / 4))))
+    columns = 2 * rows
     size = float(columns), float(rows)
     across, down = np.meshgrid(np.arange(columns + 1.0), np.linspace(0.02, rows - 0.02, rows + 1))
     pixels = np.stack([across, down], axis=-1)
@@ -134,7 +142,8 @@ def room_mesh(
     kept = vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
     if textured:
         uv = pixels.reshape(-1, 2)[used] / size
-        texture = cv2.resize(picture, _TEXTURE_HW[::-1], interpolation=cv2.INTER_AREA)
+        height = min(_TEXTURE_HW[0], max(64, int(np.sqrt(_ALL_TEXELS / count / 2)) // 2 * 2))
+        texture = cv2.resize(picture, (2 * height, height), interpolation=cv2.INTER_AREA)
         return SharedMesh(
             *kept,
             uv=np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1).astype(np.float32),
@@ -144,6 +153,13 @@ def room_mesh(
     return SharedMesh(*kept, colors_rgb=shown.round().astype(np.uint8))
 
 
-def room_map(room: RoomOutline, size_hw: tuple[int, int], *, camera_height: float) -> NDArray[np.float32]:
-    """Return the ranges of a room at all pixels of a panorama, (H, W) float32."""
-    return room_ranges(room, ray_grid(size_hw), camera_height=camera_height).astype(np.float32)
+def room_map(
+    room: RoomOutline, size_hw: tuple[int, int], *, camera_height: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the ranges of a room at all pixels of a panorama, (H, W) float32, and their relative deviations."""
+    rays = ray_grid(size_hw)
+    ranges = room_ranges(room, rays, camera_height=camera_height).astype(np.float32)
+    level = rays @ room.cam_from_level
+    azimuth = np.degrees(np.arctan2(level[..., 0], level[..., 2])).round().astype(np.int64) % len(room.distances)
+    is_closed = ~(room.probabilities >= _LEAST_PROBABILITY)[azimuth]
+    return ranges, np.where(is_closed, np.float32(CLOSED_UNCERTAINTY), np.float32(ROOM_UNCERTAINTY))

@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.core.paths import resolved
@@ -28,7 +29,7 @@ from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 from pano_mvs_page.maps import run_plans
 from pano_mvs_page.mesh_file import thinned
-from pano_mvs_page.outlined import ROOM_UNCERTAINTY, room_map
+from pano_mvs_page.outlined import room_map
 from pano_mvs_page.page_folder import PageFolder
 from pano_mvs_page.scene_parts import (
     RANGES_HW,
@@ -126,7 +127,7 @@ def share_run(
     shown = shown_of(
         run,
         with_mesh=bool(options.max_triangles),
-        picture=lambda name: _image(run, name, images, max_width=_ROOM_WIDTH_PX),
+        picture=lambda name: _small_image(run, name, images),
     )
     cloud, names = shown.cloud, tuple(camera.name for camera in shown.cameras)
     if not names and (cloud is None or not len(cloud)):
@@ -248,8 +249,12 @@ def _ranges_of(run: RunOutput, camera: ShownCamera) -> tuple[NDArray[np.float32]
         return ranges, None if relative is None else reduced(relative)
     if camera.room is None:
         return None, None
-    ranges = room_map(camera.room, RANGES_HW, camera_height=camera.camera_height)
-    return ranges, np.full(RANGES_HW, ROOM_UNCERTAINTY, np.float32)
+    return room_map(camera.room, RANGES_HW, camera_height=camera.camera_height)
+
+
+def _small_image(run: RunOutput, name: str, images: Path | None) -> NDArray[np.uint8] | None:
+    image = _image(run, name, images, max_width=_ROOM_WIDTH_PX)
+    return None if image is None else reduced_panorama(image, _ROOM_WIDTH_PX)
 
 
 def _image(run: RunOutput, name: str, images: Path | None, *, max_width: int) -> NDArray[np.uint8] | None:

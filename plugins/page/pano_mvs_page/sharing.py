@@ -99,9 +99,10 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
 def _has_house(out: Path) -> bool:
     """Return whether links made a house of a run that stopped, because matches join no two of its panoramas."""
     try:
-        return HOUSE_FILE in RunSummary.read(out).files
+        summary = RunSummary.read(out)
     except InputError:
         return False
+    return HOUSE_FILE in summary.files and not summary.poses.registered
 
 
 def open_in_browser(page: Path, *, environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:

@@ -17,7 +17,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import House, PlacedBy, PointCloud, Poses, RoomOutline
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs_page.mesh_file import SharedMesh, joined_meshes, run_mesh
-from pano_mvs_page.outlined import room_cloud, room_mesh
+from pano_mvs_page.outlined import closed_walls, room_cloud, room_mesh
 
 _PLACED = {
     PlacedBy.LINKS: "placed by links of the tour",
@@ -119,7 +119,8 @@ def _whole_house(run: RunOutput, house: House, *, with_mesh: bool, picture: Pict
         # A mesh hides the cloud, so that rooms have one only if the groups do.
         if with_mesh and (meshes or not groups):
             textured = not meshes or meshes[0].texture is not None
-            meshes.append(room_mesh(room, image, pose, camera_height=height, textured=textured))
+            drawn_as = room_mesh(room, image, pose, camera_height=height, textured=textured, count=len(rooms))
+            meshes.append(drawn_as)
     if drawn:
         notes.append(
             f"{plural(drawn, 'a room', f'{drawn} rooms')} without ranges {plural(drawn, 'is', 'are')} "
@@ -163,7 +164,11 @@ def _outlined_rooms(house: House) -> dict[str, tuple[RoomOutline, float]]:
     if height is None:
         return {}
     single = {name for name, group in zip(house.names, house.groups, strict=True) if group < 0}
-    return {name: (room, height) for name, room in house.rooms.items() if name in single}
+    return {
+        name: (room, height)
+        for name, room in house.rooms.items()
+        if name in single and np.isfinite(closed_walls(room)).any()
+    }
 
 
 def _moves(group: Poses, house: House, number: int) -> list[tuple[int, Similarity3] | None]:

@@ -46,7 +46,12 @@ def test_ranges_end_at_floor_ceiling_and_walls() -> None:
     off = off_surfaces(POSE.inverse().apply(rays * ranges[:, None]))
     assert np.percentile(off, 98) < 0.001
     assert off.max() < 0.03, "corners are between two azimuths"
-    assert room_map(outline(), (32, 64), camera_height=HEIGHT).shape == (32, 64)
+    unsure = np.full(360, 0.9, np.float32)
+    unsure[40:75] = 0.2
+    for found, least, most in ((outline(), 0.05, 0.05), (outline(unsure), 0.05, 0.2)):
+        shown, deviations = room_map(found, (32, 64), camera_height=HEIGHT)
+        assert shown.shape == deviations.shape == (32, 64)
+        assert (deviations.min(), deviations.max()) == (np.float32(least), np.float32(most))
 
 
 def test_walls_that_are_probably_wrong_are_closed_by_those_beside_them() -> None:
@@ -84,7 +89,8 @@ def test_points_and_triangles_are_on_surfaces_of_the_room() -> None:
         assert off_surfaces(mesh.vertices).max() < 0.03
         assert np.percentile(off_surfaces(middle), 95) < 0.02
         # Triangles face the camera.
-        normals = np.cross(*(mesh.vertices[mesh.faces[:, side]] - mesh.vertices[mesh.faces[:, 0]] for side in (1, 2)))
+        first, second, third = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+        normals = np.cross(second - first, third - first)
         towards = np.sum(normals * (POSE.center - middle), axis=1)
         assert (towards > -1e-7).all()
         assert (mesh.uv is not None) == (mesh.colors_rgb is None) == textured
@@ -123,6 +129,26 @@ def test_the_page_shows_rooms_that_links_place(tmp_path: Path, mesh: bool) -> No
     assert (before.mesh is not None) == (after.mesh is not None) == mesh
     if before.mesh is not None and after.mesh is not None:
         assert len(after.mesh.faces) > len(before.mesh.faces)
+
+
+def test_many_rooms_are_coarser() -> None:
+    one, many = (room_mesh(outline(), box(), POSE, camera_height=HEIGHT, textured=True, count=count)
+                 for count in (1, 40))  # fmt: skip
+    assert one.texture is not None
+    assert many.texture is not None
+    assert 40 * len(many.faces) < 450_000 < 40 * len(one.faces)
+    assert 40 * many.texture.shape[0] * many.texture.shape[1] < 9_000_000
+    assert off_surfaces(many.vertices).max() < 0.03
+
+
+def test_a_room_of_which_no_wall_is_known_is_not_drawn(tmp_path: Path) -> None:
+    run, _ = with_house(box_run(tmp_path, points=2_000), tmp_path / "images")
+    unknown = outline(np.zeros(360, np.float32))
+    document = house_document(read_house(run.out / "house.json").with_rooms({ATTIC: unknown}))
+    (run.out / "house.json").write_text(json.dumps(document))
+    shown = shown_of(load(run.out), with_mesh=True, picture=lambda _: box())
+    assert all(camera.room is None for camera in shown.cameras)
+    assert len(shown.notes) == 1
 
 
 def test_rooms_without_a_camera_height_or_a_picture_are_left_out(tmp_path: Path) -> None:

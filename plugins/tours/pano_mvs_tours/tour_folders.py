@@ -93,9 +93,10 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
 
 
 def is_tour(folder: Path) -> bool:
-    """Return whether a folder holds two scenes or more, and no other panorama outside of its subfolders.
+    """Return whether a folder holds two scenes or more, and no other panorama.
 
-    Scenes are complete cubes, or panoramas that a configuration joins by links with directions.
+    Scenes are complete cubes, or panoramas that a configuration joins by links with directions. Subfolders of cubes may
+    hold other panoramas.
 
     Raises:
         InputError: if the names of its files alone show these cubes, because its configuration cannot be read.
@@ -104,19 +105,18 @@ def is_tour(folder: Path) -> bool:
         capture = _Capture(folder, list(files_below(folder, [])))
     except InputError:
         return False
-    cubes, unreadable = _cubes(capture, _TILES), list[str]()
+    cubes, whole, unreadable = _cubes(capture, _TILES), set[Path](), list[str]()
     if len(cubes) < 2:
         scenes = list(_stated(capture, [], unreadable))
-        joined = any(link.direction_deg is not None for scene in scenes for link in scene.links)
-        whole = [scene.panorama for scene in scenes if scene.panorama is not None and joined]
         cubes = [dict(scene.tiles) for scene in scenes if scene.tiles]
-        cubes += [{("f", 0, 0): panorama} for panorama in whole]
+        if any(link.direction_deg is not None for scene in scenes for link in scene.links):
+            whole = {scene.panorama for scene in scenes if scene.panorama is not None}
     by_name = not cubes and bool(unreadable)
     if by_name:
         cubes = _cubes(capture, _TILES + _SIX_FILES)
-    used = {path for tiles in cubes for path in tiles.values()}
-    others = (path for path in capture.pictures.values() if path.parent == folder and path not in used)
-    holds = len(cubes) > 1 and not any(map(_is_panorama, others))
+    used = {path for tiles in cubes for path in tiles.values()} | whole
+    others = (path for path in capture.pictures.values() if (whole or path.parent == folder) and path not in used)
+    holds = len(cubes) + len(whole) > 1 and not any(map(_is_panorama, others))
     if holds and by_name:
         raise InputError(
             f"{unreadable[0]}. Correct the file, or read the scenes by the names of their files with "

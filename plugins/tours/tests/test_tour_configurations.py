@@ -277,7 +277,7 @@ def test_our_own_exports_are_read(tmp_path: Path, file: str) -> None:
     assert [link.direction_deg for scene in scenes for link in scene.links] == [pytest.approx((150.0, -20.0))] * 2
     assert [scene.panorama for scene in scenes] == [tmp_path / f"pictures/no {n}.jpg" for n in range(2)]
     assert is_tour(tmp_path), "links say where scenes stand"
-    write(tmp_path / "another.jpg", np.tile(face_of("f"), (1, 2, 1)))
+    write(tmp_path / "pictures/another.jpg", np.tile(face_of("f"), (1, 2, 1)))
     assert not is_tour(tmp_path), "no panorama is left out"
 
 

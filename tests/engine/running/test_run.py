@@ -210,13 +210,24 @@ def test_on_error_stop_and_gates_stop_with_exit_code_4(toy: Toy) -> None:
 
 def test_what_does_not_depend_on_a_stage_that_stops_the_run_is_computed(toy: Toy) -> None:
     """Where matches join no two panoramas, the links of a tour still say where they stand."""
-    toy.begin(
-        'from pano_mvs.api import RunStoppedError\nraise RunStoppedError("nothing to show")', of="Consecutive pairs."
-    )
+    stop = 'from pano_mvs.api import RunStoppedError\nraise RunStoppedError("nothing to show")'
+    toy.begin(stop, of="Consecutive pairs.")
     result = toy.run()
     assert (result.exit_code, result.stopped) == (RunStoppedError.exit_code, "nothing to show")
     assert sorted(result.published) == [f"mean/{number}.txt" for number in range(1, 6)]
     assert not result.failures
+    assert result.warnings == ["pairs stops the run; what does not depend on it is still computed"]
+    # A second reason to stop does not hide the first one.
+    toy.begin(stop.replace("nothing to show", "nothing to add"), of="Less the whole part of the mean.")
+    again = toy.run("shifted.gate={nothing: 1}", "mean.gate={nothing: {max: 1}}")
+    assert again.exit_code == RunStoppedError.exit_code
+    assert again.stopped in {"nothing to show", "nothing to add"}
+
+
+def test_one_of_many_units_that_stops_the_run_stops_it_at_once(toy: Toy) -> None:
+    toy.begin('from pano_mvs.api import RunStoppedError\nraise RunStoppedError("enough")')
+    result = toy.run()
+    assert (result.exit_code, result.stopped, list(result.published)) == (RunStoppedError.exit_code, "enough", [])
 
 
 def test_empty_source_of_failures_only_is_an_input_error(toy: Toy) -> None:
