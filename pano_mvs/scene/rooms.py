@@ -100,7 +100,7 @@ class RoomOutline(Record):
         for name in ("distances", "probabilities"):
             require_array(self, name, dtype=np.float32, shape=(OUTLINE_AZIMUTHS,), finite=False)
         turn = self.cam_from_level
-        require(bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)), self, "cam_from_level is no rotation")
+        require(bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)), self, "cam_from_level is not a rotation")
         require(
             (self.ceiling is None) == (self.wall_rad is None), self, "a ceiling without walls, or walls without one"
         )

@@ -13,8 +13,9 @@ from pano_mvs_page.mesh_file import SharedMesh
 
 ROOM_UNCERTAINTY = 0.05
 """Relative standard deviation of ranges on walls that pictures outline; see `RoomOutline.probabilities`."""
-CLOSED_UNCERTAINTY = 0.2
-"""The same where walls beside them close a gap."""
+CLOSED_UNCERTAINTY = 0.4
+"""The same where walls beside them close a gap: 68 % of 3,600 azimuths of eight rendered houses are within it, and of
+2,300 of ZInD's sample tour."""
 _LEAST_PROBABILITY = 0.5
 _POINTS = 60_000
 _ROWS = 96  # of the mesh of a room; fewer if there are many
