@@ -100,7 +100,9 @@ def _level_walls(segments: Segments, up: FloatArray) -> tuple[FloatArray, float 
     """Return the rotation into a level frame near `up` (3,) in which lines are upright or along walls, and a wall."""
     upright, wall, most = up, None, 0.0
     starts = directions_around(up, _TILT_DEG, _TILT_STEP_DEG)
-    for start in starts[np.argsort(-(starts @ up), kind="stable")]:
+    # Rounded, so that equal angles keep their order on all processors.
+    nearest_first = np.argsort(-(starts @ up).round(6), kind="stable")
+    for start in starts[nearest_first]:
         near = rotation_from_two_vectors(start, UP)
         turned = segments.turned(near)
         azimuth = wall_azimuth(turned)

@@ -102,7 +102,7 @@ def room_cloud(
         normals_in_world=(-rays @ house_from_cam.rotation.T).astype(np.float32),
         colors_rgb=colors,
         view_counts=np.ones(len(rays), np.uint8),
-        uncertainty=(ROOM_UNCERTAINTY * ranges).astype(np.float32),
+        uncertainty=(_deviations(room, rays @ room.cam_from_level) * ranges).astype(np.float32),
     )
 
 
@@ -160,7 +160,11 @@ def room_map(
     """Return the ranges of a room at all pixels of a panorama, (H, W) float32, and their relative deviations."""
     rays = ray_grid(size_hw)
     ranges = room_ranges(room, rays, camera_height=camera_height).astype(np.float32)
-    level = rays @ room.cam_from_level
-    azimuth = np.degrees(np.arctan2(level[..., 0], level[..., 2])).round().astype(np.int64) % len(room.distances)
-    is_closed = ~(room.probabilities >= _LEAST_PROBABILITY)[azimuth]
-    return ranges, np.where(is_closed, np.float32(CLOSED_UNCERTAINTY), np.float32(ROOM_UNCERTAINTY))
+    return ranges, _deviations(room, rays @ room.cam_from_level)
+
+
+def _deviations(room: RoomOutline, level_rays: FloatArray) -> NDArray[np.float32]:
+    """Return the relative deviations of the ranges of a room along rays (..., 3) of its level frame."""
+    azimuth = np.degrees(np.arctan2(level_rays[..., 0], level_rays[..., 2])).round().astype(np.int64)
+    is_closed = ~(room.probabilities >= _LEAST_PROBABILITY)[azimuth % len(room.distances)]
+    return np.where(is_closed, np.float32(CLOSED_UNCERTAINTY), np.float32(ROOM_UNCERTAINTY))
