@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.vertical_lines import find_segments, turn_into_walls
 from pano_mvs.algorithms.structure.room_outlines import ceilings_of, lines_of, outline_of
@@ -49,9 +50,12 @@ def test_lines_along_walls_say_how_a_camera_is_tilted() -> None:
     assert np.degrees(np.arccos(turn @ UP @ (TILT @ UP))) < 0.2
 
 
-def test_a_picture_without_walls_has_no_outline() -> None:
-    shade = np.linspace(60, 200, SIZE_HW[0])[:, None, None]
-    picture = np.broadcast_to(shade, (*SIZE_HW, 3)).astype(np.uint8)
+SHADE = np.broadcast_to(np.linspace(60, 200, SIZE_HW[0])[:, None, None], (*SIZE_HW, 3)).astype(np.uint8)
+NOISE = np.random.default_rng(1).integers(0, 256, (*SIZE_HW, 3), np.uint8)
+
+
+@pytest.mark.parametrize("picture", [SHADE, NOISE], ids=["shade", "noise"])
+def test_a_picture_without_walls_has_no_outline(picture: NDArray[np.uint8]) -> None:
     lines = lines_of(picture, ALL)
     lines.check()
     assert lines.wall_rad is None
