@@ -51,10 +51,12 @@ SLOW = (
     "export.mesh",
     "export.mesh_textured",
     "features.aliked",
+    "features.rooms",
     "masks.operator",
     "poses.localise",
 )
-SIZES_HW = {"poses.colmap_sift": (96, 192)}
+# In smaller pictures, a few lines decide how a camera is levelled.
+SIZES_HW = {"features.room_lines": (256, 512), "poses.colmap_sift": (96, 192)}
 
 
 def contract_tests(package: str) -> list[ParameterSet]:
