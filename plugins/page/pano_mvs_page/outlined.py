@@ -89,10 +89,14 @@ def room_ranges(room: RoomOutline, rays_in_cam: FloatArray, *, camera_height: fl
 def room_cloud(
     room: RoomOutline, picture: NDArray[np.uint8], cam_from_house: Rigid3, *, camera_height: float
 ) -> PointCloud:
-    """Return points on floor, ceiling and walls, with the colours of the panorama (H, W, 3)."""
+    """Return points on floor and walls, with the colours of the panorama (H, W, 3).
+
+    The ceiling is left out, which would hide the room from above.
+    """
     rays = spiral_rays(_POINTS)
     ranges = room_ranges(room, rays, camera_height=camera_height)
-    known = np.isfinite(ranges)
+    height = -(rays @ room.cam_from_level)[:, 1] * ranges
+    known = np.isfinite(ranges) & (height < 0.99 * camera_height * (room.ceiling or np.inf))
     rays, ranges = rays[known], ranges[known]
     size = picture.shape[0], picture.shape[1]
     colors = sample_panorama(picture, pixel_from_ray(rays, size)).round().astype(np.uint8)

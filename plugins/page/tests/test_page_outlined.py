@@ -83,6 +83,7 @@ def test_points_and_triangles_are_on_surfaces_of_the_room() -> None:
     assert off_surfaces(cloud.points_in_world).max() < 0.03
     below = cloud.colors_rgb[cloud.points_in_world[:, 1] > POSE.center[1] + 0.99 * HEIGHT]
     assert np.abs(below.astype(float) - [150, 110, 70]).mean() < 3, "the floor has its colour"
+    assert cloud.points_in_world[:, 1].min() > POSE.center[1] - 0.7 * HEIGHT, "the ceiling would hide the room"
     for textured in (True, False):
         mesh = room_mesh(outline(), picture, POSE, camera_height=HEIGHT, textured=textured)
         middle = mesh.vertices[mesh.faces].mean(axis=1)
