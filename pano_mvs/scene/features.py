@@ -27,6 +27,8 @@ class Features(Record):
         learned: number of key points, the last ones, that the network ALIKED found and LightGlue can match.
         ups: directions of the camera frame that may be the zenith; views were levelled by each for the network.
         per_up: number of learned key points in the views of each of `ups`, in their order; empty: all in the first's.
+        walls_from_cam: (3, 3) rotation into a frame whose y points down and whose x and z are along walls at right
+            angles, by the lines of the picture; None if it shows none, or nothing has looked for them.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -41,6 +43,7 @@ class Features(Record):
     learned: int = 0
     ups: tuple[tuple[float, float, float], ...] = ((0.0, -1.0, 0.0),)
     per_up: tuple[int, ...] = ()
+    walls_from_cam: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Convert the tuples, which are stored as lists."""
@@ -78,6 +81,10 @@ class Features(Record):
         counts = self.per_up or (self.learned,)
         counted = (len(counts), sum(counts)) == (len(self.ups), self.learned) and min(counts) >= 0
         require(counted or not self.learned, self, "per_up must state for each of ups how many key points are learned")
+        if self.walls_from_cam is not None:
+            require_array(self, "walls_from_cam", dtype=np.float64, shape=(3, 3))
+            turned_back = self.walls_from_cam @ self.walls_from_cam.T
+            require(bool(np.allclose(turned_back, np.eye(3), atol=1e-4)), self, "walls_from_cam is not a rotation")
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.networks import Networks, Provider
 from pano_mvs.algorithms.poses.frame.upside_down import LEVEL_DEG, ups_of_picture
+from pano_mvs.algorithms.poses.frame.walls import walls_of_picture
 from pano_mvs.api import Context, Each, Features, InputPath, Panorama, Params, arguments_from, params_from, stage
 from pano_mvs.scene import WeakImage
 
@@ -98,7 +100,8 @@ def aliked(
     levelled by the lines in the panorama. Without any, its own up direction counts. Where these and brightness and
     texture leave open which way a turned camera was held, the network sees it with each likely direction up.
     The result begins with the key points of an earlier stage of features, if there is one. After matches.weak, images
-    that need no learned key points keep theirs.
+    that need no learned key points keep theirs. The directions of walls in the picture are stored with them: they
+    distinguish true relative poses from those of things that look alike.
     """
     if params.only_weak and weak is not None and features is not None and not weak.wanted:
         return features
@@ -109,6 +112,7 @@ def aliked(
             "{count} panoramas may be turned or upside down, by their lines, brightness and texture, so networks see "
             "them in each likely orientation"
         )
-    learned = extract_aliked(picture, mask, ups=ups, networks=params.networks, **arguments_from(extract_aliked, params))
+    found = extract_aliked(picture, mask, ups=ups, networks=params.networks, **arguments_from(extract_aliked, params))
+    learned = replace(found, walls_from_cam=walls_of_picture(picture, mask, ups[0]))
     ctx.metric("keypoints", len(learned))
     return learned if features is None else joined(features, learned)

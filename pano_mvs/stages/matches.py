@@ -7,8 +7,22 @@ import numpy as np
 from pano_mvs.algorithms.learned.lightglue import few_and_all_matches, match_learned
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.learned_pairs import is_settled
+from pano_mvs.algorithms.two_view.linked_pairs import judged_by_links
 from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.api import All, Context, Features, Near, Params, TwoView, TwoViews, arguments_from, params_from, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    Features,
+    Near,
+    Panorama,
+    Params,
+    TwoView,
+    TwoViews,
+    arguments_from,
+    params_from,
+    stage,
+)
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.stages.features import NetworkParams
 
 
@@ -54,10 +68,36 @@ def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -
     return two_view
 
 
-@stage("matches.merge")
-def merge(matches: All[TwoView], added: All[TwoView] | None) -> TwoViews:
-    """Return the pairs of two stages; of a pair in both, the added geometry, even if it is not verified."""
-    return TwoViews({**matches, **(added or {})})
+@stage("matches.merge", memory="600MB")
+def merge(
+    matches: All[TwoView],
+    added: All[TwoView] | None,
+    features: All[Features] | None,
+    images: All[Panorama] | None,
+    ctx: Context,
+) -> TwoViews:
+    """Return the pairs of two stages; of a pair in both, the added geometry, even if it is not verified.
+
+    Of scenes of a virtual tour that lead to each other, the directions of the links count beside the learned matches.
+    """
+    merged = {**matches, **(added or {})}
+    links = {name: image.links for name, image in (images or {}).items() if image.links}
+    if not links or features is None:
+        return TwoViews(merged)
+    judged = judged_by_links(merged, features, links)
+    found = [pair for pair, view in judged.items() if view and not merged[pair]]
+    lost = [pair for pair, view in judged.items() if merged[pair] and not view]
+    ctx.metric("by_links", len(found))
+    if found:
+        ctx.note(f"links of the tour confirm the matches of {_named(found)}")
+    if lost:
+        ctx.note(f"links of the tour contradict the matches of {_named(lost)}")
+    return TwoViews(judged)
+
+
+def _named(pairs: list[tuple[str, str]]) -> str:
+    names = shortened_list([f"{first} and {second}" for first, second in pairs])
+    return f"{len(pairs)} {plural(len(pairs), 'pair')}: {names}"
 
 
 def _report_pair(two_view: TwoView, candidates: int, ctx: Context) -> None:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.vertical_lines import find_segments, turn_into_walls
+from pano_mvs.algorithms.poses.frame.walls import walls_of_picture
 from pano_mvs.algorithms.structure.room_outlines import ceilings_of, lines_of, outline_of
 from pano_mvs.geometry import UP, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import RoomLines
@@ -48,6 +49,20 @@ def test_lines_along_walls_say_how_a_camera_is_tilted() -> None:
     turn, weight = turn_into_walls(segments, np.radians(25.0))
     assert 0 < weight <= segments.weights.sum()
     assert np.degrees(np.arccos(turn @ UP @ (TILT @ UP))) < 0.2
+
+
+def test_the_frame_of_walls_is_upright_and_along_them() -> None:
+    found = walls_of_picture(box(), ALL, UP)
+    assert found is not None
+    walls = rotation_from_rotvec((0.0, np.radians(25.0), 0.0))[:, [0, 2]].T @ TILT.T
+    across = np.abs(walls @ found.T)  # of either wall, by the axes of the frame
+    assert np.degrees(np.arccos(across[:, [0, 2]].max(axis=1))) == pytest.approx(0.0, abs=0.5)
+    assert np.degrees(np.arccos(-(found @ TILT @ UP)[1])) < 0.2
+    assert walls_of_picture(NOISE, ALL, UP) is None
+    # A panorama of more columns is reduced, and what is masked does not count.
+    large = np.repeat(np.repeat(box(), 4, axis=0), 4, axis=1)
+    assert walls_of_picture(large, np.ones(large.shape[:2], np.bool_), UP) is not None
+    assert walls_of_picture(large, np.zeros(large.shape[:2], np.bool_), UP) is None
 
 
 SHADE = np.broadcast_to(np.linspace(60, 200, SIZE_HW[0])[:, None, None], (*SIZE_HW, 3)).astype(np.uint8)

@@ -13,18 +13,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.vertical_lines import (
-    Segments,
-    directions_around,
-    find_segments,
-    turn_into_walls,
-    wall_azimuth,
-)
+from pano_mvs.algorithms.poses.frame.vertical_lines import find_segments
+from pano_mvs.algorithms.poses.frame.walls import level_and_walls
 from pano_mvs.algorithms.structure.outline import Labels, best_walls, pieces
 from pano_mvs.algorithms.structure.skyline import Skyline, clearest_total, skyline, wall_distances
 from pano_mvs.algorithms.structure.view import blurred
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.geometry import UP, Rigid3, rotation_from_two_vectors
+from pano_mvs.geometry import UP, Rigid3
 from pano_mvs.scene.rooms import CEILINGS, Ceilings, RoomLines, RoomOutline
 
 _COARSE_DISTANCES, _DISTANCES = np.geomspace(0.3, 9.0, 160), np.geomspace(0.3, 9.0, 200)
@@ -41,12 +36,6 @@ _MOVED, _MOVING_COST = np.linspace(0.94, 1.06, 13), 100.0
 # are right where it says 35, 50, 69 and 90 %.
 _ODDS, _OTHER_WALL = (-1.316, 2.315, 0.3425), 0.1
 
-# The vertical is searched within this tilt from several starts, each of which finds it within 3°. One that is farther
-# away must have more lines on the vertical and the walls by this factor. At least this length of lines and this share
-# of all must be on them: .27 to .67 in rendered and real rooms, .04 of many lines and .2 of 3 rad in noise.
-_TILT_DEG, _TILT_STEP_DEG, _BETTER = 15.0, 5.0, 1.1
-_LEAST_RAD, _LEAST_SHARE = 3.0, 0.15
-
 
 def lines_of(picture: Picture, valid: NDArray[np.bool_], up_in_cam: Sequence[float] | None = None) -> RoomLines:
     """Return what the lines of a panorama say of the room around it.
@@ -58,7 +47,7 @@ def lines_of(picture: Picture, valid: NDArray[np.bool_], up_in_cam: Sequence[flo
     """
     up = np.asarray(UP if up_in_cam is None else up_in_cam, np.float64)
     segments = find_segments({"": lambda: (picture, valid)}, {"": np.eye(3)})
-    level_from_cam, wall = _level_walls(segments, up)
+    level_from_cam, wall = level_and_walls(segments, up)
     if wall is None:
         return RoomLines(level_from_cam.T, None, np.zeros(0, np.float32))
     around = skyline(blurred(picture), Rigid3(level_from_cam.T, np.zeros(3)), _TURN_STEP)
@@ -96,29 +85,6 @@ def outline_of(picture: Picture, lines: RoomLines, ceilings: Ceilings) -> RoomOu
     return RoomOutline(
         lines.cam_from_level, lines.wall_rad, ceiling, found.astype(np.float32), right.astype(np.float32)
     )
-
-
-def _level_walls(segments: Segments, up: FloatArray) -> tuple[FloatArray, float | None]:
-    """Return the rotation into a level frame near `up` (3,) in which lines are upright or along walls, and a wall."""
-    upright, wall, most = up, None, max(_LEAST_RAD, _LEAST_SHARE * float(segments.weights.sum())) / _BETTER
-    starts = directions_around(up, _TILT_DEG, _TILT_STEP_DEG)
-    # Rounded, so that equal angles keep their order on all processors.
-    nearest_first = np.argsort(-(starts @ up).round(6), kind="stable")
-    for start in starts[nearest_first]:
-        near = rotation_from_two_vectors(start, UP)
-        turned = segments.turned(near)
-        azimuth = wall_azimuth(turned)
-        if not np.isfinite(azimuth):
-            continue
-        turn, weight = turn_into_walls(turned, azimuth)
-        if weight > _BETTER * most:
-            most, upright = weight, near.T @ turn @ UP
-            wall = near.T @ turn @ [np.sin(azimuth), 0.0, np.cos(azimuth)]
-    level_from_cam = rotation_from_two_vectors(upright, UP)
-    if wall is None:
-        return level_from_cam, None
-    across = level_from_cam @ wall
-    return level_from_cam, float(np.arctan2(across[0], across[2]) % (np.pi / 2))
 
 
 def _ceiling_clarity(around: Skyline, wall_rad: float, ceilings: FloatArray) -> FloatArray:

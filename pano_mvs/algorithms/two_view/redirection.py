@@ -9,6 +9,8 @@ from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose,
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 
+_WALLS_RAD = float(np.deg2rad(0.5))  # allows for the errors of the directions of walls
+
 
 def best_redirected(
     poses: list[Rigid3], first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
@@ -88,6 +90,32 @@ def direction_candidates(
     direction_costs(rotated, np.ascontiguousarray(q), directions, threshold_rad, costs)
     signs = np.where(costs[:, 0] <= costs[:, 1], 1.0, -1.0)
     return directions * signs[:, None], costs.min(axis=1)
+
+
+def poses_along_walls(
+    rotations: FloatArray, first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> list[Rigid3]:
+    """Return the best relative pose near each of some rotations, |t| = 1, if any.
+
+    Two images that show walls at right angles have only four rotations to one another. Given the rotation, two matches
+    determine a relative pose, so that a few true matches among many false ones are enough.
+
+    Args:
+        rotations: (K, 3, 3) of second_from_first.
+        first: (M, 3) unit rays in the first image.
+        second: (M, 3) in the second.
+        rng: draws the matches.
+        threshold_rad: maximum Sampson error of an inlier, after refinement.
+    """
+    wide_rad = max(_WALLS_RAD, threshold_rad)
+    bands = [widen * threshold_rad for widen in (3.0, 2.0, 1.0)]
+    poses = []
+    for rotation in rotations if len(first) > 2 else ():
+        directions, costs = direction_candidates(rotation, first, second, rng=rng, threshold_rad=wide_rad, count=400)
+        if len(directions):
+            rough = Rigid3(rotation, directions[int(np.argmin(costs))])
+            poses.append(refined_on_agreeing(rough, first, second, thresholds_rad=bands, least=8)[0])
+    return poses
 
 
 def upright_poses(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -19,11 +20,12 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     Marks,
     log_odds_of,
     marks_of,
+    parallel_walls,
     weight_of_learned,
 )
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import estimate_rotation, estimate_two_view
-from pano_mvs.algorithms.two_view.redirection import upright_poses
+from pano_mvs.algorithms.two_view.redirection import poses_along_walls, upright_poses
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose, refined_on_agreeing
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, independent_count, significance_of_pose
 from pano_mvs.core.arrays import FloatArray
@@ -36,6 +38,7 @@ MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""
 
 _THRESHOLD_RAD = float(np.deg2rad(0.2))
+_MIN_INLIERS = 10
 
 
 @checks_settings
@@ -46,7 +49,7 @@ def verify_pair(
     *,
     rng: np.random.Generator,
     threshold_deg: Annotated[float, Setting("maximum angular Sampson error of an inlier", gt=0, le=10)] = 0.2,
-    min_inliers: Annotated[int, Setting("minimum number of inliers of a pair", ge=8)] = 10,
+    min_inliers: Annotated[int, Setting("minimum number of inliers of a pair", ge=8)] = _MIN_INLIERS,
     solver: Annotated[
         Solver, Setting("minimal solver; eight_point is the paper's, and unreliable on planar scenes")
     ] = "five_point",
@@ -65,7 +68,8 @@ def verify_pair(
 
     If a network has found key points in both images, false matches agree with one another far more often than shuffled
     ones. How significant a pose must be then depends on what else speaks for it, such as a floor (see `learned_pairs`).
-    Of the best pose, its runners-up and upright poses, the most probable one counts.
+    Of the best pose, its runners-up, upright poses and those that keep the walls of both images at right angles, the
+    most probable one counts.
 
     Args:
         first: key points of the first image.
@@ -182,6 +186,35 @@ def pose_near(
     if not np.isfinite(alarms) or pair.why_open(view := pair.view(evidence)):
         return None
     return near, alarms, weight_of_pair(first, second, view, log10_false_alarms=alarms)
+
+
+def judged_again(first: Features, second: Features, view: TwoView, *, odds_of: Callable[[Rigid3], float]) -> TwoView:
+    """Return the most probable geometry of a pair of learned matches by further evidence about its poses.
+
+    Args:
+        first: key points of the first image.
+        second: key points of the second image.
+        view: the pair as `verify_pair` has returned it.
+        odds_of: what else speaks for a pose, second_from_first with |t| = 1: a logarithm of odds, 0 for nothing.
+    """
+    if view.geometry == "rotation" or not (first.learned and second.learned):
+        return view
+    pair = _Pair(first, second, view.all_matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, _MIN_INLIERS)
+    minimal = SOLVERS["five_point"]
+    known = []
+    for rank, one in enumerate((*([view] if view else []), *view.alternatives)):
+        found = pair.evidence(Rigid3(one.rotation, one.direction), sample=minimal.sample, models=minimal.models)
+        if not np.isfinite(found.log10_false_alarms):
+            continue
+        if rank == 0:  # of the best one it is known how it was found
+            alarms = view.log10_false_alarms
+            found = replace(found, log10_false_alarms=alarms)
+            found = replace(found, log_odds=log_odds_of(alarms, pair_marks(first, second, pair.view(found))))
+        if not pair.why_open(pair.view(found)):
+            further = odds_of(found.pose)
+            likely = found.log_odds + further >= ACCEPTED_ODDS or (found.likely and further >= 0)
+            known.append(replace(found, log_odds=found.log_odds + further, likely=likely))
+    return _by_odds(pair, known, most=len(view.alternatives)) if known else view
 
 
 def weight_of_pair(first: Features, second: Features, view: TwoView, *, log10_false_alarms: float) -> float:
@@ -361,6 +394,16 @@ def _upright(pair: _Pair) -> list[_Evidence]:
     return found
 
 
+def _along_walls(pair: _Pair) -> list[_Evidence]:
+    """Return poses of the pair that keep the walls of its images at right angles, if both show walls."""
+    first, second = pair.first.walls_from_cam, pair.second.walls_from_cam
+    if first is None or second is None:
+        return []
+    rotations = second.T @ parallel_walls() @ first
+    poses = poses_along_walls(rotations[:4], pair.p, pair.q, rng=pair.rng, threshold_rad=pair.threshold_rad)
+    return [pair.evidence(pose, sample=2, models=len(poses)) for pose in poses]
+
+
 def _distinct(pair: _Pair, pose: Rigid3, *, most: int) -> list[Rigid3]:
     """Return the pose, or its better twin, and at most `most` others with enough matches of their own."""
     return distinct_geometries(
@@ -384,7 +427,7 @@ def _most_probable(pair: _Pair, found: list[_Evidence], *, most: int, reason: st
         reason: why no pose was found.
     """
     minimal = SOLVERS["five_point"]
-    tried = [*found, *_upright(pair)]
+    tried = [*found, *_upright(pair), *_along_walls(pair)]
     for best in found:
         tried += [
             pair.evidence(pose, sample=minimal.sample, models=minimal.models)
@@ -393,6 +436,11 @@ def _most_probable(pair: _Pair, found: list[_Evidence], *, most: int, reason: st
     known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not pair.why_open(pair.view(one))]
     if not known:
         return pair.judged(found[0]) if found else pair.failed(reason)
+    return _by_odds(pair, known, most=most)
+
+
+def _by_odds(pair: _Pair, known: list[_Evidence], *, most: int) -> TwoView:
+    """Return the geometry of the most probable of some poses, with at most `most` others (see `_most_probable`)."""
     ranked: list[_Evidence] = []
     for one in sorted(known, key=lambda one: -one.log_odds):
         if all(are_distinct(one.pose, other.pose) for other in ranked):

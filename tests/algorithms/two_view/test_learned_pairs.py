@@ -13,6 +13,7 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     CERTAIN,
     PRIOR_ODDS,
     WEIGHTS,
+    WEIGHTS_WITH_WALLS,
     Marks,
     log_odds_of,
     marks_of,
@@ -26,7 +27,8 @@ from tools.benchmarks.poses.tours.pair_evidence import fitted, left_out, prior_o
 
 HEIGHT, DISTANCE = 1.6, 2.4
 POSE = Rigid3.from_center(rotation_from_rotvec((0.0, 0.7, 0.0)), np.array([DISTANCE, 0.0, 0.0]))
-TABLE = Path(__file__).parents[3] / "tools/benchmarks/poses/tours/pair_evidence.csv"
+TABLES = Path(__file__).parents[3] / "tools/benchmarks/poses/tours"
+TABLE, TABLE_WITH_WALLS = TABLES / "pair_evidence.csv", TABLES / "pair_evidence_walls.csv"
 
 
 def _room(*, below: int = 60, above: int = 60) -> FloatArray:
@@ -86,6 +88,59 @@ def test_of_several_likely_zeniths_those_that_agree_count() -> None:
     assert marks_of(turned[0], turned[1], _unit(POSE), rays=rays, direction_std_deg=0.5) == _marks(rays)
 
 
+def _with_walls(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Return the frames of walls in the first camera, and in the second one at POSE."""
+    first = rotation_from_rotvec(np.radians([0.0, 20.0, 0.0]))
+    error = rotation_from_rotvec(np.radians([tilt_deg, turn_deg, 0.0]))
+    quarter = rotation_from_rotvec((0.0, -np.pi / 2, 0.0))
+    return first, error @ quarter @ first @ POSE.rotation.T
+
+
+def test_walls_at_right_angles_and_a_level_baseline_speak_for_a_pose() -> None:
+    rays = _rays(_room())
+    plain = [features_from_bearings(one) for one in rays]
+
+    def marks(turn_deg: float = 0.0, tilt_deg: float = 0.0, pose: Rigid3 = POSE) -> Marks:
+        ends = [
+            replace(features, walls_from_cam=walls)
+            for features, walls in zip(plain, _with_walls(turn_deg, tilt_deg), strict=True)
+        ]
+        return marks_of(ends[0], ends[1], _unit(pose), rays=rays, direction_std_deg=0.5)
+
+    assert (marks().walls, marks().level) == (-2.0, -1.0)
+    assert marks(turn_deg=2.0).walls == pytest.approx(1.0)
+    assert marks(tilt_deg=4.0).walls == pytest.approx(2.0)
+    assert marks(turn_deg=44.0).walls == 4.0
+    higher = Rigid3.from_center(POSE.rotation, np.array([DISTANCE, -DISTANCE / 5, 0.0]))
+    assert marks(pose=higher).level == pytest.approx(np.log2(np.degrees(np.arctan(0.2))), abs=0.01)
+    for worse in (marks(turn_deg=10.0), marks(pose=higher)._replace(floor=marks().floor)):
+        assert log_odds_of(-60, worse) < log_odds_of(-60, marks())
+    # An image that shows no walls leaves both unknown, and what is unknown counts neither for nor against a pose.
+    half = replace(plain[0], walls_from_cam=_with_walls()[0])
+    unknown = marks_of(half, plain[1], _unit(POSE), rays=rays, direction_std_deg=0.5)
+    assert np.isnan([unknown.walls, unknown.level]).all()
+    assert log_odds_of(-60, unknown) == log_odds_of(-60, _marks(rays))
+
+
+def test_a_few_true_matches_are_found_by_the_walls_of_both_images() -> None:
+    """Fifteen true matches among 120 that a network has found, where three at random are true once in 500 times."""
+    rng = np.random.default_rng(4)
+    points = _room(below=8, above=7)
+    true = [one + rng.normal(0, 3e-4, one.shape) for one in _rays(points)]
+    false = rng.normal(size=(2, 105, 3)) * [1.0, 0.4, 1.0]
+    rays = [np.concatenate([one, other]) for one, other in zip(true, false, strict=True)]
+    ends = [features_from_bearings(one / np.linalg.norm(one, axis=1, keepdims=True)) for one in rays]
+    ends = [
+        replace(one, learned=len(one), walls_from_cam=walls) for one, walls in zip(ends, _with_walls(), strict=True)
+    ]
+    idx = np.stack([np.arange(120)] * 2, axis=1).astype(np.int32)
+    view = verify_pair(ends[0], ends[1], idx, rng=np.random.default_rng(0))
+    hypotheses = [view] if view else view.alternatives
+    off = [np.degrees(geodesic_angle(one.rotation, POSE.rotation)) for one in hypotheses]
+    assert min(off) < 1.0
+    assert view.log10_false_alarms < 0
+
+
 def test_what_a_pair_weighs_beside_others() -> None:
     marks = _marks(_rays(_room()))
     accepted = next(exponent for exponent in range(3, 400) if log_odds_of(-exponent, marks) >= ACCEPTED_ODDS)
@@ -99,6 +154,7 @@ def test_what_a_pair_weighs_beside_others() -> None:
 def test_the_weights_are_those_of_the_table() -> None:
     rows = read_table(TABLE)
     assert fitted(rows) == pytest.approx(WEIGHTS, abs=0.02)
+    assert fitted(read_table(TABLE_WITH_WALLS)) == pytest.approx(WEIGHTS_WITH_WALLS, abs=0.02)
     assert prior_odds(rows) == pytest.approx(PRIOR_ODDS, abs=0.02)
     assert pytest.approx(np.log(5)) == ACCEPTED_ODDS
 
@@ -110,6 +166,9 @@ def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
     assert accepted > 0.7 * right
     assert wrong <= 0.05 * accepted
     assert plain_wrong > 0.2 * plain
+    right, accepted, wrong, *_ = np.array(list(left_out(read_table(TABLE_WITH_WALLS)).values())).sum(axis=0)
+    assert accepted >= 0.9 * right
+    assert wrong <= 0.03 * accepted
 
 
 def test_of_two_poses_that_matches_agree_on_the_more_probable_one_counts() -> None:

@@ -5,9 +5,10 @@ relative pose of each pair that a network has matched is right if it agrees with
 15° where the truth was drawn by hand. `--table FILE` gets a row for each pair; without DIR, the rows are read from it.
 
 A logistic regression gives the odds that a pair is right by its false alarms and its `Marks`, which are
-the coefficients of `pano_mvs.algorithms.two_view.learned_pairs`. Which pose of a pair counts depends on them, so the
-table is written anew with new ones, until they stay. The table shows the pairs that they accept, fitted to all captures
-but the one of the row, beside those with at most 10⁻⁵⁰ false alarms.
+the coefficients of `pano_mvs.algorithms.two_view.learned_pairs`. The marks of walls count if all rows have them. Which
+pose of a pair counts depends on the coefficients, so the table is written anew with new ones, until they stay. The
+table shows the pairs that they accept, fitted to all captures but the one of the row, beside those with at most 10⁻⁵⁰
+false alarms.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ def read_table(file: Path) -> list[PairRow]:
                 row["first"],
                 row["second"],
                 float(row["log10_false_alarms"]),
-                Marks(*(float(row[name]) for name in Marks._fields)),
+                Marks(*(float(row.get(name, "nan")) for name in Marks._fields)),
                 row["right"] == "1",
             )
             for row in csv.DictReader(stream)
@@ -131,7 +132,7 @@ def write_table(file: Path, rows: Sequence[PairRow]) -> None:
 
 def fitted(rows: Sequence[PairRow]) -> NDArray[np.float64]:
     """Return the coefficients: of one, of the exponent, and of the marks, each with its known sign."""
-    terms = np.array([terms_of(row.log10_false_alarms, row.marks) for row in rows])
+    terms = _terms(rows, walls=_have_walls(rows))
     sign = np.where([row.right for row in rows], 1.0, -1.0)
 
     def loss(weights: NDArray[np.float64]) -> float:
@@ -140,7 +141,17 @@ def fitted(rows: Sequence[PairRow]) -> NDArray[np.float64]:
 
     better = {"floor", "parallax"}
     bounds = [(None, None), (0, None), *((0, None) if name in better else (None, 0) for name in Marks._fields)]
-    return np.asarray(minimize(loss, np.zeros(terms.shape[1]), bounds=bounds).x)
+    return np.asarray(minimize(loss, np.zeros(terms.shape[1]), bounds=bounds[: terms.shape[1]]).x)
+
+
+def _have_walls(rows: Sequence[PairRow]) -> bool:
+    return not any(np.isnan(row.marks.walls) for row in rows)
+
+
+def _terms(rows: Sequence[PairRow], *, walls: bool) -> NDArray[np.float64]:
+    """Return the terms of each pair, (N, 9), or without the marks of walls, (N, 7)."""
+    nothing = {} if walls else {"walls": np.nan, "level": np.nan}
+    return np.array([terms_of(row.log10_false_alarms, row.marks._replace(**nothing)) for row in rows])
 
 
 def prior_odds(rows: Sequence[PairRow]) -> float:
@@ -156,7 +167,7 @@ def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
         weights = fitted([row for row in rows if row.capture != capture])
         own = [row for row in rows if row.capture == capture]
         right = np.array([row.right for row in own])
-        odds = np.array([terms_of(row.log10_false_alarms, row.marks) for row in own]) @ weights
+        odds = _terms(own, walls=_have_walls(rows)) @ weights
         exponents = np.array([row.log10_false_alarms for row in own])
         fit, plain = (odds >= ACCEPTED_ODDS) | (exponents <= CERTAIN), exponents <= -50
         counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
