@@ -62,7 +62,8 @@ class RunHistory:
     ) -> None:
         """Store the keys of a run, replacing those of the last run of the same workflow into the same folder.
 
-        If the run did not finish, the earlier keys of the units that it had not reached are kept.
+        If the run did not finish, the earlier keys of the units that it had not reached are kept. A folder that was
+        moved or copied has those of its earlier place.
 
         Args:
             temporary: stages whose results the run does not need any more; see `dropping`.
@@ -70,10 +71,16 @@ class RunHistory:
         name = f"{workflow_id[:16]}-{digest_from_value(str(resolved(out)))[:16]}"
         if not finished:
             own = _read(self.root / "runs" / f"{name}.json")
-            before = own.keys if own is not None else self.last_keys(workflow_id)
+            before = own.keys if own is not None else self._keys_of_moved(workflow_id, keys)
             keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
         when = datetime.now(UTC).isoformat(timespec="seconds")
         self._write("runs", RunEntry(name, workflow, str(resolved(out)), when, keys, temporary=tuple(temporary)))
+
+    def _keys_of_moved(self, workflow_id: str, keys: Keys) -> Keys:
+        """Return the keys of the latest run of a workflow if it had a unit in common; else it had another capture."""
+        last = self.last_keys(workflow_id)
+        common = any(units.items() & last.get(stage, {}).items() for stage, units in keys.items())
+        return last if common else {}
 
     def last_keys(self, workflow_id: str) -> Keys:
         """Return the keys of the latest run of a workflow; empty if there is none."""

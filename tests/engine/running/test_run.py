@@ -515,6 +515,23 @@ def test_a_run_that_ends_forgets_the_units_that_are_no_more(finished: Toy, shelf
     assert remembered(finished)["scaled"] == everything - {"5.txt"}
 
 
+def test_a_part_of_another_capture_has_its_own_units_alone(finished: Toy, shelf: Shelf) -> None:
+    """Into another folder with the same cache; the results of the run were those of both captures."""
+    for number in range(1, 6):
+        (finished.folder / "capture" / f"{number}.txt").unlink()
+    finished.number("other.txt", "7")
+    session = finished.session()
+    Run(
+        session.workflow,
+        session.graph,
+        Store(session.store_root),
+        out=session.out.with_name("other"),
+        executor=shelf,
+        options=RunOptions(until=("scaled",)),
+    ).execute()
+    assert remembered(finished)["images"] == {"other.txt"}
+
+
 def test_a_run_without_failures_forgets_them_too(finished: Toy, shelf: Shelf) -> None:
     (finished.folder / "capture" / "5.txt").unlink()
     assert run_with(finished, shelf).exit_code == 0
