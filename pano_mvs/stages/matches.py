@@ -8,7 +8,7 @@ from pano_mvs.algorithms.learned.lightglue import few_and_all_matches, match_lea
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.learned_pairs import is_settled
 from pano_mvs.algorithms.two_view.linked_pairs import judged_by_links
-from pano_mvs.algorithms.two_view.verification import verify_pair
+from pano_mvs.algorithms.two_view.verification import pair_marks, verify_pair
 from pano_mvs.api import (
     All,
     Context,
@@ -62,7 +62,7 @@ def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -
     for learned in few_and_all_matches(first, second, networks=params.networks, **settings):
         candidates = np.concatenate([found, learned])
         two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
-        if is_settled(two_view):
+        if is_settled(two_view, pair_marks(first, second, two_view) if two_view else None):
             break
     _report_pair(two_view, len(candidates), ctx)
     return two_view

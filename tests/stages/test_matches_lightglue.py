@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.learned.lightglue import LightGlue, Side, few_and_all_matches, match_learned
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, Array
-from pano_mvs.algorithms.two_view.learned_pairs import is_settled
+from pano_mvs.algorithms.two_view.learned_pairs import Marks, is_settled
 from pano_mvs.api import Context
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
@@ -94,10 +94,15 @@ def test_the_first_views_are_compared_by_their_strongest_key_points(compared: li
 
 def test_a_pair_is_settled_if_it_is_clear_or_shows_no_sign_of_a_geometry() -> None:
     failed = TwoView.failed("chance")
-    assert is_settled(failed)
-    assert is_settled(replace(failed, log10_false_alarms=-4.0))
-    assert not is_settled(replace(failed, log10_false_alarms=-12.0))
-    assert not is_settled(replace(failed, geometry="rotation")), "other views may show a parallax"
+    assert is_settled(failed, None)
+    assert is_settled(replace(failed, log10_false_alarms=-4.0), None)
+    assert not is_settled(replace(failed, log10_false_alarms=-12.0), None)
+    assert not is_settled(replace(failed, geometry="rotation"), None), "other views may show a parallax"
     verified = next(iter(tiny_capture().each(TwoView).values()))
-    assert is_settled(replace(verified, log10_false_alarms=-120.0))
-    assert not is_settled(replace(verified, log10_false_alarms=-80.0))
+    marks = Marks(tilt=0.1, floor=1.0, near=0.0, parallax=4.0, open=-3.0)
+    assert is_settled(replace(verified, log10_false_alarms=-120.0), marks)
+    assert not is_settled(replace(verified, log10_false_alarms=-80.0), marks)
+    # With walls, odds have to be clear as well: by the most similar views, copies of a room look like one.
+    for walls, is_clear in ((-2.0, True), (1.5, False)):
+        with_walls = marks._replace(walls=walls, level=-1.0)
+        assert is_settled(replace(verified, log10_false_alarms=-120.0), with_walls) == is_clear

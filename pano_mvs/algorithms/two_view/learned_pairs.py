@@ -24,10 +24,11 @@ from pano_mvs.scene import Features, TwoView
 
 CERTAIN = -250.0
 """Enough whatever the marks: in ten places, no false pair has as few false alarms (10⁻²³³); equal offices have some."""
-_SETTLED, _HOPELESS = -100.0, -5.0
+_SETTLED, _SETTLED_ODDS, _HOPELESS = -100.0, 5.0, -5.0
 """What three pairs of views of 60 pairs of ZInD's sample tour settle. Of 12 that they verify with at most the first
 number, all views move no geometry by a degree; of 8 others, one by 7°. Of 31 that they do not verify and that have more
-than the second, all views verify none; of 9 others, one."""
+than the third, all views verify none; of 9 others, one. A copy of a room had odds of 3.3 by three pairs of views, and
+less than one to one by all of them: with walls, odds below the second settle nothing."""
 _BELOW = 0.25  # sine of how far below the horizon a match may lie on a floor
 
 
@@ -63,18 +64,29 @@ WEIGHTS_WITH_WALLS = (-7.983, 2.211, 0.0, 1.278, -4.314, 1.311, -0.898, -1.689, 
 ACCEPTED_ODDS = float(np.log(5.0))
 """A pose is accepted with five to one, because a wrong one costs as much as five missed ones."""
 
+ACCEPTED_ODDS_WITH_WALLS = float(np.log(12.0))
+"""With twelve to one if both images show walls: of nine places, each judged by the others, this accepts 130 right pairs
+and one wrong one; five to one accepts 134 and four."""
+
 WEAKEST, PRIOR_ODDS = -3.0, -0.3
 """log₁₀ of the false alarms of the weakest pairs that count, and the logarithm of the odds of any such pair."""
 
 
-def is_settled(view: TwoView) -> bool:
+def is_settled(view: TwoView, marks: Marks | None) -> bool:
     """Return whether further matches hardly change a pair: its geometry is clear, or there is no sign of one.
 
     Views that are most alike may show what is far away, so that two places seem to be one: this is left open.
+
+    Args:
+        view: the geometry of the pair by a part of its matches.
+        marks: of this geometry; None without one.
     """
     if view.geometry == "rotation":
         return False
-    return view.log10_false_alarms <= _SETTLED if view else view.log10_false_alarms > _HOPELESS
+    if not view or marks is None:
+        return view.log10_false_alarms > _HOPELESS
+    is_clear = np.isnan(marks.walls) or log_odds_of(view.log10_false_alarms, marks) >= _SETTLED_ODDS
+    return view.log10_false_alarms <= _SETTLED and bool(is_clear)
 
 
 def terms_of(log10_false_alarms: float, marks: Marks) -> FloatArray:
@@ -87,6 +99,11 @@ def log_odds_of(log10_false_alarms: float, marks: Marks) -> float:
     """Return the natural logarithm of the odds that the pose of a learned pair is right."""
     weights = WEIGHTS if np.isnan(marks.walls) else WEIGHTS_WITH_WALLS
     return float(terms_of(log10_false_alarms, marks) @ weights)
+
+
+def accepted_odds(marks: Marks) -> float:
+    """Return the logarithm of the odds with which a pose is accepted."""
+    return ACCEPTED_ODDS if np.isnan(marks.walls) else ACCEPTED_ODDS_WITH_WALLS
 
 
 def marks_of(
@@ -154,7 +171,9 @@ def weight_of_learned(log10_false_alarms: float, marks: Marks) -> float:
     """Return how much a pose says beside others: its likelihood ratio relative to that with which a pair is accepted.
 
     It is the logarithm of the odds beyond those of any pair; 0 if they are less, and 1 if the pair is just accepted by
-    itself.
+    itself. Walls only lower it: what weights say of cameras was fitted without them, and a copy of a room has walls in
+    the same directions.
     """
-    gained = log_odds_of(log10_false_alarms, marks) - PRIOR_ODDS
-    return max(gained / (ACCEPTED_ODDS - PRIOR_ODDS), float(log10_false_alarms <= CERTAIN), 0.0)
+    without_walls = marks._replace(walls=np.nan, level=np.nan)
+    log_odds = min(log_odds_of(log10_false_alarms, one) for one in (marks, without_walls))
+    return max((log_odds - PRIOR_ODDS) / (ACCEPTED_ODDS - PRIOR_ODDS), float(log10_false_alarms <= CERTAIN), 0.0)

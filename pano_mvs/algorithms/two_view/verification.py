@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view.alternatives import are_distinct, distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
 from pano_mvs.algorithms.two_view.learned_pairs import (
-    ACCEPTED_ODDS,
     CERTAIN,
     WEAKEST,
     Marks,
+    accepted_odds,
     log_odds_of,
     marks_of,
     parallel_walls,
@@ -207,13 +207,13 @@ def judged_again(first: Features, second: Features, view: TwoView, *, odds_of: C
         if not np.isfinite(found.log10_false_alarms):
             continue
         if rank == 0:  # of the best one it is known how it was found
-            alarms = view.log10_false_alarms
-            found = replace(found, log10_false_alarms=alarms)
-            found = replace(found, log_odds=log_odds_of(alarms, pair_marks(first, second, pair.view(found))))
-        if not pair.why_open(pair.view(found)):
-            further = odds_of(found.pose)
-            likely = found.log_odds + further >= ACCEPTED_ODDS or (found.likely and further >= 0)
-            known.append(replace(found, log_odds=found.log_odds + further, likely=likely))
+            found = replace(found, log10_false_alarms=view.log10_false_alarms)
+        geometry, further = pair.view(found), odds_of(found.pose)
+        marks = pair_marks(first, second, geometry)
+        log_odds = log_odds_of(found.log10_false_alarms, marks) + further
+        likely = log_odds >= accepted_odds(marks) or (found.likely and further >= 0)
+        if not pair.why_open(geometry):
+            known.append(replace(found, log_odds=log_odds, likely=likely))
     return _by_odds(pair, known, most=len(view.alternatives)) if known else view
 
 
@@ -327,7 +327,7 @@ class _Pair:
             return found
         marks = pair_marks(self.first, self.second, self.view(found))
         log_odds = log_odds_of(alarms, marks)
-        return replace(found, log_odds=log_odds, likely=log_odds >= ACCEPTED_ODDS or alarms <= CERTAIN)
+        return replace(found, log_odds=log_odds, likely=log_odds >= accepted_odds(marks) or alarms <= CERTAIN)
 
     def view(self, evidence: _Evidence) -> TwoView:
         """Return the geometry of a pose with inliers."""

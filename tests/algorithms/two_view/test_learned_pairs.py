@@ -10,11 +10,13 @@ import pytest
 
 from pano_mvs.algorithms.two_view.learned_pairs import (
     ACCEPTED_ODDS,
+    ACCEPTED_ODDS_WITH_WALLS,
     CERTAIN,
     PRIOR_ODDS,
     WEIGHTS,
     WEIGHTS_WITH_WALLS,
     Marks,
+    accepted_odds,
     log_odds_of,
     marks_of,
     weight_of_learned,
@@ -157,6 +159,8 @@ def test_the_weights_are_those_of_the_table() -> None:
     assert fitted(read_table(TABLE_WITH_WALLS)) == pytest.approx(WEIGHTS_WITH_WALLS, abs=0.02)
     assert prior_odds(rows) == pytest.approx(PRIOR_ODDS, abs=0.02)
     assert pytest.approx(np.log(5)) == ACCEPTED_ODDS
+    assert accepted_odds(rows[0].marks) == ACCEPTED_ODDS
+    assert accepted_odds(rows[0].marks._replace(walls=0.0, level=0.0)) == ACCEPTED_ODDS_WITH_WALLS
 
 
 def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
@@ -167,8 +171,8 @@ def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
     assert wrong <= 0.05 * accepted
     assert plain_wrong > 0.2 * plain
     right, accepted, wrong, *_ = np.array(list(left_out(read_table(TABLE_WITH_WALLS)).values())).sum(axis=0)
-    assert accepted >= 0.9 * right
-    assert wrong <= 0.03 * accepted
+    assert accepted >= 0.85 * right
+    assert wrong <= 0.01 * accepted
 
 
 def test_of_two_poses_that_matches_agree_on_the_more_probable_one_counts() -> None:

@@ -267,7 +267,7 @@ def _evidence_of_pairs(
         if geometry is not None and view.log10_false_alarms < 0:
             ordered = features if i < j else features[::-1]
             own = weight_of_pair(*ordered, geometry, log10_false_alarms=view.log10_false_alarms)
-            own = max(own, float(bool(view)))  # links of a tour may have confirmed it
+            own = max(own, float(bool(view)))  # by walls, or links of a tour
             if not view and own >= 1 and not all(one.learned for one in features):
                 continue  # it was refused since its direction is open, such as for distant scenery alone
             if _is_same(oriented(geometry, i, j)[0], relative):

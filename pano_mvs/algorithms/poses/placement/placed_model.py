@@ -73,7 +73,7 @@ class Pairs:
             geometry = view if view else next(iter(view.alternatives), None)
             if geometry is not None and view.geometry != "rotation" and one.learned and other.learned:
                 weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
-                weight = max(weight, float(bool(view)))  # links of a tour may have confirmed it
+                weight = max(weight, float(bool(view)))  # by walls, or links of a tour
                 if weight:
                     found[edge] = weight
         return found

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, CERTAIN, WEAKEST, Marks, terms_of
+from pano_mvs.algorithms.two_view.learned_pairs import CERTAIN, WEAKEST, Marks, accepted_odds, terms_of
 from pano_mvs.algorithms.two_view.verification import pair_marks
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
@@ -169,7 +169,7 @@ def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
         right = np.array([row.right for row in own])
         odds = _terms(own, walls=_have_walls(rows)) @ weights
         exponents = np.array([row.log10_false_alarms for row in own])
-        fit, plain = (odds >= ACCEPTED_ODDS) | (exponents <= CERTAIN), exponents <= -50
+        fit, plain = (odds >= accepted_odds(own[0].marks)) | (exponents <= CERTAIN), exponents <= -50
         counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
         found[capture] = tuple(int(one.sum()) for one in counts)
     return found
