@@ -68,6 +68,9 @@ ACCEPTED_ODDS_WITH_WALLS = float(np.log(12.0))
 """With twelve to one if both images show walls: of nine places, each judged by the others, this accepts 130 right pairs
 and one wrong one; five to one accepts 134 and four."""
 
+PARALLEL = 2.0
+"""Largest mark `walls` of a pose that they do not contradict: 4°. True poses of a real house have up to 3.2°."""
+
 WEAKEST, PRIOR_ODDS = -3.0, -0.3
 """log₁₀ of the false alarms of the weakest pairs that count, and the logarithm of the odds of any such pair."""
 
@@ -101,9 +104,23 @@ def log_odds_of(log10_false_alarms: float, marks: Marks) -> float:
     return float(terms_of(log10_false_alarms, marks) @ weights)
 
 
-def accepted_odds(marks: Marks) -> float:
-    """Return the logarithm of the odds with which a pose is accepted."""
-    return ACCEPTED_ODDS if np.isnan(marks.walls) else ACCEPTED_ODDS_WITH_WALLS
+def is_accepted(log10_false_alarms: float, marks: Marks, *, further: float = 0.0) -> bool:
+    """Return whether a pose is so probable that it is accepted.
+
+    Walls of real houses are at right angles to some degrees only. A pose that is probable without them is refused only
+    if they contradict it.
+
+    Args:
+        log10_false_alarms: of the pose.
+        marks: what else speaks for it.
+        further: what is known beside these, as a logarithm of odds.
+    """
+    without_walls = marks._replace(walls=np.nan, level=np.nan)
+    is_probable = log_odds_of(log10_false_alarms, without_walls) + further >= ACCEPTED_ODDS
+    if np.isnan(marks.walls):
+        return is_probable
+    by_walls = log_odds_of(log10_false_alarms, marks) + further >= ACCEPTED_ODDS_WITH_WALLS
+    return by_walls or (is_probable and marks.walls <= PARALLEL)
 
 
 def marks_of(

@@ -7,6 +7,7 @@ A link stands where the next scene is, or at the door that leads there: of 25 li
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -42,17 +43,16 @@ def judged_by_links(
         if not there and not back:
             continue
         ends = features[first], features[second]
-
-        def odds_of(
-            pose: Rigid3,
-            there: list[FloatArray] = there,
-            back: list[FloatArray] = back,
-            ends: tuple[Features, Features] = ends,
-        ) -> float:
-            return _log_odds(there, pose.center, ends[0]) + _log_odds(back, pose.translation, ends[1])
-
+        odds_of = partial(_odds_of_pose, there=there, back=back, ends=ends)
         result[first, second] = judged_again(*ends, view, odds_of=odds_of)
     return result
+
+
+def _odds_of_pose(
+    pose: Rigid3, *, there: Sequence[FloatArray], back: Sequence[FloatArray], ends: tuple[Features, Features]
+) -> float:
+    """Return what links from the first image to the second one and back say of a pose: a logarithm of odds."""
+    return _log_odds(there, pose.center, ends[0]) + _log_odds(back, pose.translation, ends[1])
 
 
 def _directions(links: Sequence[SceneLink], name: str) -> list[FloatArray]:

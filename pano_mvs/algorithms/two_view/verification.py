@@ -17,7 +17,7 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     CERTAIN,
     WEAKEST,
     Marks,
-    accepted_odds,
+    is_accepted,
     log_odds_of,
     marks_of,
     parallel_walls,
@@ -210,8 +210,9 @@ def judged_again(first: Features, second: Features, view: TwoView, *, odds_of: C
             found = replace(found, log10_false_alarms=view.log10_false_alarms)
         geometry, further = pair.view(found), odds_of(found.pose)
         marks = pair_marks(first, second, geometry)
-        log_odds = log_odds_of(found.log10_false_alarms, marks) + further
-        likely = log_odds >= accepted_odds(marks) or (found.likely and further >= 0)
+        alarms = found.log10_false_alarms
+        log_odds = log_odds_of(alarms, marks) + further
+        likely = is_accepted(alarms, marks, further=further) or (found.likely and further >= 0)
         if not pair.why_open(geometry):
             known.append(replace(found, log_odds=log_odds, likely=likely))
     return _by_odds(pair, known, most=len(view.alternatives)) if known else view
@@ -326,8 +327,8 @@ class _Pair:
         if self.known or not (self.first.learned and self.second.learned):
             return found
         marks = pair_marks(self.first, self.second, self.view(found))
-        log_odds = log_odds_of(alarms, marks)
-        return replace(found, log_odds=log_odds, likely=log_odds >= accepted_odds(marks) or alarms <= CERTAIN)
+        likely = is_accepted(alarms, marks) or alarms <= CERTAIN
+        return replace(found, log_odds=log_odds_of(alarms, marks), likely=likely)
 
     def view(self, evidence: _Evidence) -> TwoView:
         """Return the geometry of a pose with inliers."""

@@ -16,7 +16,7 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     WEIGHTS,
     WEIGHTS_WITH_WALLS,
     Marks,
-    accepted_odds,
+    is_accepted,
     log_odds_of,
     marks_of,
     weight_of_learned,
@@ -143,6 +143,20 @@ def test_a_few_true_matches_are_found_by_the_walls_of_both_images() -> None:
     assert view.log10_false_alarms < 0
 
 
+def test_walls_refuse_a_probable_pose_only_if_they_contradict_it() -> None:
+    probable = Marks(tilt=0.2, floor=0.8, near=0.0, parallax=4.5, open=-2.0)
+    assert is_accepted(-60.0, probable)
+    for walls, accepted in ((-2.0, True), (1.5, True), (2.5, False)):
+        marks = probable._replace(walls=walls, level=0.0)
+        assert is_accepted(-60.0, marks) == accepted
+        assert is_accepted(-60.0, marks, further=-6.0) is False
+    # One that is not, is accepted if walls speak for it.
+    improbable = probable._replace(floor=0.0, parallax=3.0)
+    assert not is_accepted(-60.0, improbable)
+    assert is_accepted(-60.0, improbable._replace(walls=-2.0, level=-1.0), further=1.0)
+    assert not is_accepted(-60.0, improbable._replace(walls=1.5, level=-1.0), further=1.0)
+
+
 def test_what_a_pair_weighs_beside_others() -> None:
     marks = _marks(_rays(_room()))
     accepted = next(exponent for exponent in range(3, 400) if log_odds_of(-exponent, marks) >= ACCEPTED_ODDS)
@@ -159,8 +173,7 @@ def test_the_weights_are_those_of_the_table() -> None:
     assert fitted(read_table(TABLE_WITH_WALLS)) == pytest.approx(WEIGHTS_WITH_WALLS, abs=0.02)
     assert prior_odds(rows) == pytest.approx(PRIOR_ODDS, abs=0.02)
     assert pytest.approx(np.log(5)) == ACCEPTED_ODDS
-    assert accepted_odds(rows[0].marks) == ACCEPTED_ODDS
-    assert accepted_odds(rows[0].marks._replace(walls=0.0, level=0.0)) == ACCEPTED_ODDS_WITH_WALLS
+    assert pytest.approx(np.log(12)) == ACCEPTED_ODDS_WITH_WALLS
 
 
 def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
@@ -171,7 +184,7 @@ def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
     assert wrong <= 0.05 * accepted
     assert plain_wrong > 0.2 * plain
     right, accepted, wrong, *_ = np.array(list(left_out(read_table(TABLE_WITH_WALLS)).values())).sum(axis=0)
-    assert accepted >= 0.85 * right
+    assert accepted >= 0.9 * right
     assert wrong <= 0.01 * accepted
 
 

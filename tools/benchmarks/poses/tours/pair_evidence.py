@@ -23,7 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.two_view.learned_pairs import CERTAIN, WEAKEST, Marks, accepted_odds, terms_of
+from pano_mvs.algorithms.two_view.learned_pairs import (
+    ACCEPTED_ODDS,
+    ACCEPTED_ODDS_WITH_WALLS,
+    CERTAIN,
+    PARALLEL,
+    WEAKEST,
+    WEIGHTS,
+    Marks,
+    terms_of,
+)
 from pano_mvs.algorithms.two_view.verification import pair_marks
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
@@ -163,13 +172,18 @@ def prior_odds(rows: Sequence[PairRow]) -> float:
 def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
     """Return for each capture its right pairs; the right and the wrong ones by the fit to the others; and by 10⁻⁵⁰."""
     found = {}
+    with_walls = _have_walls(rows)
+    least = ACCEPTED_ODDS_WITH_WALLS if with_walls else ACCEPTED_ODDS
     for capture in sorted({row.capture for row in rows}):
         weights = fitted([row for row in rows if row.capture != capture])
         own = [row for row in rows if row.capture == capture]
         right = np.array([row.right for row in own])
-        odds = _terms(own, walls=_have_walls(rows)) @ weights
+        odds = _terms(own, walls=with_walls) @ weights
         exponents = np.array([row.log10_false_alarms for row in own])
-        fit, plain = (odds >= accepted_odds(own[0].marks)) | (exponents <= CERTAIN), exponents <= -50
+        fit, plain = (odds >= least) | (exponents <= CERTAIN), exponents <= -50
+        if with_walls:  # without walls, by the fit to the other table
+            without = _terms(own, walls=False) @ np.array(WEIGHTS)
+            fit |= (without >= ACCEPTED_ODDS) & (np.array([row.marks.walls for row in own]) <= PARALLEL)
         counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
         found[capture] = tuple(int(one.sum()) for one in counts)
     return found
