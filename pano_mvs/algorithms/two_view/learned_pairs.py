@@ -107,20 +107,20 @@ def log_odds_of(log10_false_alarms: float, marks: Marks) -> float:
 def is_accepted(log10_false_alarms: float, marks: Marks, *, further: float = 0.0) -> bool:
     """Return whether a pose is so probable that it is accepted.
 
-    Walls of real houses are at right angles to some degrees only. A pose that is probable without them is refused only
-    if they contradict it.
+    Walls of real houses are at right angles to some degrees only. A pose that is as probable without them is refused
+    only if they contradict it.
 
     Args:
         log10_false_alarms: of the pose.
         marks: what else speaks for it.
         further: what is known beside these, as a logarithm of odds.
     """
-    without_walls = marks._replace(walls=np.nan, level=np.nan)
-    is_probable = log_odds_of(log10_false_alarms, without_walls) + further >= ACCEPTED_ODDS
     if np.isnan(marks.walls):
-        return is_probable
-    by_walls = log_odds_of(log10_false_alarms, marks) + further >= ACCEPTED_ODDS_WITH_WALLS
-    return by_walls or (is_probable and marks.walls <= PARALLEL)
+        return log_odds_of(log10_false_alarms, marks) + further >= ACCEPTED_ODDS
+    least = ACCEPTED_ODDS_WITH_WALLS - further
+    without_walls = marks._replace(walls=np.nan, level=np.nan)
+    is_probable = log_odds_of(log10_false_alarms, without_walls) >= least and marks.walls <= PARALLEL
+    return is_probable or log_odds_of(log10_false_alarms, marks) >= least
 
 
 def marks_of(

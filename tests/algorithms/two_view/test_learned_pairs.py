@@ -145,11 +145,11 @@ def test_a_few_true_matches_are_found_by_the_walls_of_both_images() -> None:
 
 def test_walls_refuse_a_probable_pose_only_if_they_contradict_it() -> None:
     probable = Marks(tilt=0.2, floor=0.8, near=0.0, parallax=4.5, open=-2.0)
-    assert is_accepted(-60.0, probable)
+    assert is_accepted(-100.0, probable)
     for walls, accepted in ((-2.0, True), (1.5, True), (2.5, False)):
         marks = probable._replace(walls=walls, level=0.0)
-        assert is_accepted(-60.0, marks) == accepted
-        assert is_accepted(-60.0, marks, further=-6.0) is False
+        assert is_accepted(-100.0, marks) == accepted
+        assert is_accepted(-100.0, marks, further=-6.0) is False
     # One that is not, is accepted if walls speak for it.
     improbable = probable._replace(floor=0.0, parallax=3.0)
     assert not is_accepted(-60.0, improbable)

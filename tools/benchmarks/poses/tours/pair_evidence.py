@@ -183,7 +183,7 @@ def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
         fit, plain = (odds >= least) | (exponents <= CERTAIN), exponents <= -50
         if with_walls:  # without walls, by the fit to the other table
             without = _terms(own, walls=False) @ np.array(WEIGHTS)
-            fit |= (without >= ACCEPTED_ODDS) & (np.array([row.marks.walls for row in own]) <= PARALLEL)
+            fit |= (without >= least) & (np.array([row.marks.walls for row in own]) <= PARALLEL)
         counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
         found[capture] = tuple(int(one.sum()) for one in counts)
     return found
