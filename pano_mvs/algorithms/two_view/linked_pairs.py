@@ -19,6 +19,8 @@ from pano_mvs.scene import Features, SceneLink, TwoView
 # Of how far a link is from the other camera: shares of three distributions, normal ones with these standard deviations
 # and any direction.
 _SHARES, _STDS_DEG = (0.75, 0.20, 0.05), (10.0, 30.0)
+# What is steeper has no azimuth worth the name: an arrow at the nadir that leads back, or a scene up the stairs.
+_STEEPEST_DEG = 75.0
 
 
 def judged_by_links(
@@ -68,12 +70,15 @@ def _directions(links: Sequence[SceneLink], name: str) -> list[FloatArray]:
 def _log_odds(stated: Sequence[FloatArray], direction: FloatArray, features: Features) -> float:
     """Return how much more likely links are where they stand if the other camera is in a direction; 0 without any."""
     up = np.array(features.ups[0])
-    return max((_log_ratio(_turn_deg(ray, direction, up)) for ray in stated), default=0.0)
+    turns = [_turn_deg(ray, direction, up) for ray in stated]
+    return max((_log_ratio(turn) for turn in turns if not np.isnan(turn)), default=0.0)
 
 
 def _turn_deg(one: FloatArray, other: FloatArray, up: FloatArray) -> float:
-    """Return the angle between two directions around the vertical."""
+    """Return the angle between two unit vectors around the vertical; NaN if one of them is too steep to have one."""
     level, other_level = (ray - (ray @ up) * up for ray in (one, other))
+    if min(np.linalg.norm(level), np.linalg.norm(other_level)) < np.cos(np.deg2rad(_STEEPEST_DEG)):
+        return float("nan")
     return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(level, other_level)), level @ other_level)))
 
 

@@ -69,6 +69,12 @@ def test_links_elsewhere_contradict_it() -> None:
         assert "look alike" in judged.reason
 
 
+def test_a_link_at_the_nadir_says_nothing_of_the_direction() -> None:
+    features, refused, _ = pair()
+    links = {"a": [SceneLink("b", (azimuth_deg(FIRST), -88.0))], "b": [SceneLink("a", (azimuth_deg(SECOND), 90.0))]}
+    assert not judged_by_links({("a", "b"): refused}, features, links)["a", "b"]
+
+
 def test_pairs_without_links_that_state_directions_stay_as_they_are() -> None:
     features, refused, accepted = pair()
     for links in ({}, {"a": [SceneLink("c", (0.0, 0.0)), SceneLink("b")]}):
