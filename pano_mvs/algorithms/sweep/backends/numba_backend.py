@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.edge_support import average_volume
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import INTERPOLATED_FROM
 from pano_mvs.algorithms.sweep.numba.kernels_records import Sweep
 from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
     DRIFTS,
@@ -261,16 +262,19 @@ def _box_winners(work: SweepInput, sweep: Sweep) -> Winners:
 
 def _volume_of(work: SweepInput, sweep: Sweep, around: slice) -> NDArray[np.uint8]:
     """Return the costs of some rows, (rows, D, W)."""
-    volume = np.empty((around.stop - around.start, work.settings.planes, work.reference.shape[1]), np.uint8)
+    height, width = work.reference.shape[:2]
+    volume = np.empty((around.stop - around.start, work.settings.planes, width), np.uint8)
+    # A band needs the rows around it as well: low pictures that one thread sweeps are one band.
+    band = height if height < INTERPOLATED_FROM and numba.get_num_threads() == 1 else BAND_ROWS
 
     def sweep_rows(first: int) -> None:
-        rows = min(BAND_ROWS, around.stop - first)
+        rows = min(band, around.stop - first)
         state, planes = fresh_state(rows, volume.shape[2])
         here = first - around.start
         sweep_band(first, sweep, sweep.others, work.ranges, volume[here : here + rows], state, planes)
 
     with workers() as pool:
-        run_jobs(pool, sweep_rows, range(around.start, around.stop, BAND_ROWS))
+        run_jobs(pool, sweep_rows, range(around.start, around.stop, band))
     average_volume(volume, work, top=around.start)
     add_planes(volume, work, sweep, top=around.start)
     return volume

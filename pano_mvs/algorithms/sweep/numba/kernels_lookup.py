@@ -1,7 +1,7 @@
 """Compiled: sample one source for a band of rows of the reference at one depth hypothesis.
 
-A band is projected exactly in every eighth row and by cubic interpolation between. The exact position costs two arc
-tangents. Along a column of the reference it is smooth but near the poles of the source: there, where four exact rows
+A band is projected exactly in every eighth row and by cubic interpolation between, but for low pictures, in which eight
+rows are a large step on the sphere. The exact position costs two arc tangents. Along a column of the reference it is smooth but near the poles of the source: there, where four exact rows
 are bent too much (their third difference is large, and with it the fourth, of which a cubic between them misses 0.023),
 it is computed exactly. Rows, not columns, are skipped: a rolled picture then has the same positions, and the inner
 loops have no border.
@@ -128,6 +128,9 @@ def wrap_row(row: NDArray[Any], width: int, pad: int) -> None:
 EVERY = 8
 """Rows from one exact row to the next."""
 
+INTERPOLATED_FROM = 128
+"""Pictures with fewer rows than these are projected exactly in all of them."""
+
 _BLOCK = 16
 
 
@@ -151,16 +154,15 @@ def _across(step: np.float32, turn: np.float32) -> np.float32:
 
 
 @kernel
-def fit_group(knots: F32, first: int, height: int, turn: np.float32, curve: F32, rough: U8) -> None:
+def fit_group(knots: F32, first: int, turn: np.float32, curve: F32, rough: U8) -> None:
     """Fit cubics through the exact rows `first` to `first` + 3, and see where they are too bent for that.
 
-    `knots`: (2, K, W) float32 x and y of the exact rows. `first`: of them. `height`: rows of the reference picture.
-    `turn`: columns of the source, float32. `curve`: (2, 3, W) float32, written: first, second and third differences of
-    x and of y. `rough`: (W,) uint8, written: whether the cubic misses.
+    `knots`: (2, K, W) float32 x and y of the exact rows. `first`: of them. `turn`: columns of the source, float32.
+    `curve`: (2, 3, W) float32, written: first, second and third differences of x and of y. `rough`: (W,) uint8,
+    written: whether the cubic misses.
     """
     k, one, two, three = _U(first), _U(first + 1), _U(first + 2), _U(first + 3)
-    # In a low picture, eight rows are a large step on the sphere, so all positions are exact.
-    largest = _F(1) if height >= 128 else _F(-1)
+    largest = _F(1)
     for i in range(_U(rough.shape[0])):
         step = _across(knots[0, one, i] - knots[0, k, i], turn)
         after = _across(knots[0, two, i] - knots[0, one, i], turn)
@@ -354,16 +356,21 @@ def warp_band(
     exact = np.empty((2, width), np.float32)
     curve, rough = np.empty((2, 3, width), np.float32), np.empty(width, np.uint8)
     runs = np.empty((width // 16 + 1, 2), np.int64)
-    count = 0
-    project_knots(first, height, sin_cos_azimuth, pose, virtual_range, shape, knots)
+    count, exactly = 0, height < INTERPOLATED_FROM
+    if not exactly:
+        project_knots(first, height, sin_cos_azimuth, pose, virtual_range, shape, knots)
     for j in range(warped.shape[1]):
-        base = min(max(j // EVERY - 1, 0), knots.shape[1] - 4)
-        if j % EVERY == 0:
-            fit_group(knots, base, height, _F(shape[1]), curve, rough)
-            count = rough_runs(rough, runs)
-        follow_curve(knots, base, curve, j / EVERY - base, x_px, y_px)
-        if count:
+        if not exactly:
+            base = min(max(j // EVERY - 1, 0), knots.shape[1] - 4)
+            if j % EVERY == 0:
+                fit_group(knots, base, _F(shape[1]), curve, rough)
+                count = rough_runs(rough, runs)
+            follow_curve(knots, base, curve, j / EVERY - base, x_px, y_px)
+        if exactly or count:
             ray_row(first + j, height, pose, virtual_range, matrix, offset)
+        if exactly:
+            project_row(sin_cos_azimuth, matrix, offset, shape, 0, width, x_px, y_px)
+        else:
             for k in range(count):
                 project_row(sin_cos_azimuth, matrix, offset, shape, runs[k, 0], runs[k, 1], exact[0], exact[1])
                 replace_rough(rough, exact, runs[k, 0], runs[k, 1], x_px, y_px)
