@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import getpass
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from functools import cache
@@ -14,6 +16,14 @@ from pathlib import Path
 # Two threads of OpenBLAS cost more than twice the time of one on the small arrays in here; it reads this when numpy
 # is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# pytest rewrites the assertions of 460 modules, and the processes that tests start import 400 of the package. Where
+# Python is to write no byte code beside them, it is kept elsewhere, or each process would compile all of them again.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(tempfile.gettempdir()) / f"pano-mvs-tests-{getpass.getuser()}")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
 
 # pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
 import cv2  # noqa: F401
