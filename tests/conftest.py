@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import getpass
 import os
 import shutil
 import sys
@@ -20,8 +19,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # pytest rewrites the assertions of 460 modules, and the processes that tests start import 400 of the package. Where
 # Python is to write no byte code beside them, it is kept elsewhere, or each process would compile all of them again.
 if sys.dont_write_bytecode:
+    from pano_mvs.core.kernel_cache import user_cache_folder
+
     sys.dont_write_bytecode = False
-    sys.pycache_prefix = str(Path(tempfile.gettempdir()) / f"pano-mvs-tests-{getpass.getuser()}")
+    sys.pycache_prefix = str(user_cache_folder() / "pano-mvs" / "byte code of tests")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
 
