@@ -202,15 +202,17 @@ def test_exchanged_ranges_are_checked_against_those_before_the_exchange() -> Non
 
 
 @pytest.mark.slow
-def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
+def test_mesh_is_of_ranges_that_are_more_precise_than_those_of_the_quickstart(
     pano_mvs: Command, rendered: Path, quickstart: tuple[Path, str], tmp_path: Path
 ) -> None:
-    out, cache = tmp_path / "quality", shutil.copytree(quickstart[0].parent / "cache", tmp_path / "cache")
-    result = pano_mvs(
-        *f"run quality --images {rendered / 'images'} --out {out} --cache {cache}".split(),
-        *f"--set scores.truth={rendered / 'truth'}".split(),
-        *SMALL,
+    """The room is 6 × 2.8 × 5 units of the truth, and the mesh is in units of the first baseline."""
+    out, cache = tmp_path / "mesh", shutil.copytree(quickstart[0].parent / "cache", tmp_path / "cache")
+    settings = ("textured.triangles=10000", "textured.texture_px=512", f"scores.truth={rendered / 'truth'}")
+    arguments = (
+        *("mesh", "--images", rendered / "images", "--out", out, "--cache", cache, *SMALL),
+        *(part for setting in settings for part in ("--set", setting)),
     )
+    result = pano_mvs("run", *arguments)
     assert result.code == 0, result.text
     errors = []
     for folder in (quickstart[0], out):
@@ -219,33 +221,6 @@ def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
         assert all(np.isfinite(read_range_tiff(folder / f"range/00{view}.tiff")).mean() > 0.95 for view in range(4))
     assert errors[1] < 0.6 * errors[0]
     assert len(read_ply(out / "cloud.ply")) > 5000
-
-
-# What makes quality slow is tested with it.
-PLAIN_RANGES = (
-    *("--set", "slanted=null", "--set", "filled=null", "--set", "planes=null", "--set", "smooth=null"),
-    *("--set", "first_check=null", "--set", "first_smooth=null", "--set", "first_planes=null", "--set", "plain=null"),
-    *("--set", "exchanged=null", "--set", "checked.in={}"),
-    *("--set", "previews=null", "--set", "views.sources=2", "--set", "depth.cost=census", "--set", "depth.planes=16"),
-)
-
-
-@pytest.mark.slow
-def test_mesh_writes_a_textured_mesh_around_the_cameras(
-    pano_mvs: Command, rendered: Path, tmp_path: Path, quickstart: tuple[Path, str]
-) -> None:
-    """The room is 6 × 2.8 × 5 units of the truth, and the mesh is in units of the first baseline."""
-    out, cache = tmp_path / "out", shutil.copytree(quickstart[0].parent / "cache", tmp_path / "cache")
-    settings = ("textured.triangles=10000", "textured.texture_px=512", "textured.cell=0.1")
-    arguments = (
-        *("mesh", "--images", rendered / "images", "--out", out, "--cache", cache, "--executor", "serial"),
-        *(*SMALL, *PLAIN_RANGES, "--set", "scene_planes=null", "--set", "structure=null"),
-        *("--set", "textured.in={ranges: checked}"),
-        *("--set", f"scores.truth={rendered / 'truth'}"),
-        *(part for setting in settings for part in ("--set", setting)),
-    )
-    result = pano_mvs("run", *arguments)
-    assert result.code == 0, result.text
     read = trimesh.load(out / "mesh_textured.glb", force="mesh")
     assert isinstance(read, trimesh.Trimesh)
     assert 500 < len(read.faces) <= 1.25 * 10000  # simplified to about as many
@@ -298,9 +273,6 @@ def command(folder: Path, *options: str) -> list[str]:
     ]
 
 
-SAMPLE = ("--set", "images.max_width=512", "--set", "depth.planes=48")
-
-
 @pytest.mark.slow
 def test_poses_and_ranges_are_as_good_as_promised(tmp_path: Path, sample_cache: Path) -> None:
     subprocess.run(command(tmp_path, "--cache", str(sample_cache)), check=True)
@@ -315,9 +287,10 @@ def test_poses_and_ranges_are_as_good_as_promised(tmp_path: Path, sample_cache: 
     assert first.completeness >= 0.99, "slats of the blinds are part of the sky behind them, and frames at its edge"
 
 
-def kill_in(stage: str, folder: Path) -> None:
+def kill_in(stage: str, folder: Path, *options: str) -> None:
     """Run until the first unit of a stage is computed, and kill the run while the others are in work."""
-    process = subprocess.Popen([*command(folder, *SAMPLE), "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    line = [*command(folder, *options), "--json"]
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     events = (json.loads(line) for line in process.stdout)
     assert any((event["event"], event.get("stage")) == ("unit_finished", stage) for event in events)
@@ -335,21 +308,22 @@ def units_of(folder: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_it_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+def test_killed_in_the_middle_it_resumes_to_the_same_bytes(tmp_path: Path, rendered: Path) -> None:
     """The run is killed twice: while it matches, and in the middle of the sweep."""
+    options = ("--images", str(rendered / "images"), *SMALL, "--set", "previews=null")
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     for folder in (undisturbed, killed):
         folder.mkdir()
-    finished = subprocess.run(command(undisturbed, *SAMPLE), check=False).returncode
+    finished = subprocess.run(command(undisturbed, *options), check=False).returncode
     assert finished in (0, 3), "3: at this size, a camera may be doubtful"
     whole = units_of(undisturbed)
-    kill_in("matches", killed)
+    kill_in("matches", killed, *options)
     matched = times_of_records(killed)
-    kill_in("depth", killed)
+    kill_in("depth", killed, *options)
     swept = times_of_records(killed)
     assert 0 < len(matched) < len(swept) < whole["run"]
     assert matched.items() <= swept.items()  # what was computed is not computed again
-    assert subprocess.run(command(killed, *SAMPLE), check=False).returncode == finished
+    assert subprocess.run(command(killed, *options), check=False).returncode == finished
     resumed = units_of(killed)
     assert resumed["run"] + len(swept) == whole["run"]
     assert resumed["run"] + resumed["cached"] == whole["run"] + whole["cached"]
