@@ -14,7 +14,6 @@ import pytest
 from pano_mvs.cli.plugins.new import EXAMPLES, KINDS, rendered, rendered_package
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.testing import conformance
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.cli.conftest import Command, deliverables, run_json
 from tests.engine.conftest import Toy
@@ -49,23 +48,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, text in zip((f"new_{kind}.py", f"test_new_{kind}.py"), rendered(kind, f"new_{kind}"), strict=True):
             (folder / name).write_text(text)
     return folder
-
-
-@pytest.mark.usefixtures("mine")
-@pytest.mark.parametrize(
-    "kind",
-    [
-        # The command is started in a process, to see which libraries it loads.
-        pytest.param(kind, marks=pytest.mark.slow) if kind in ("command", "sweep_backend") else kind
-        for kind in KINDS
-    ],
-)
-def test_a_new_plugin_keeps_its_contract(written: Path, kind: str) -> None:
-    example = {"example": EXAMPLES[kind].format(name=f"new_{kind}")} if kind in EXAMPLES else {}
-    contract_tests = getattr(conformance, KINDS[kind].contract_tests)(written / f"new_{kind}.py", **example)
-    assert len(contract_tests) >= 2
-    for contract_test in contract_tests:
-        contract_test.check()
 
 
 @pytest.mark.slow
