@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 import pano_mvs as installed
-from pano_mvs.testing.tiny_capture import tiny_capture
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.cli.conftest import Command, run_json
 from tests.io.images.pictures import app1, exif
 from tests.synthetic.video_files import counted, write_video
@@ -116,7 +116,9 @@ def edit(path: Path, change: Callable[[str], str]) -> None:
 def test_an_edit_of_a_kernel_costs_the_units_that_depend_on_it_and_a_comment_none(tmp_path: Path) -> None:
     package = tmp_path / "copy" / "pano_mvs"
     shutil.copytree(Path(installed.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "tiny.yaml").write_text(WORKFLOW.replace("CAPTURE", str(tiny_capture().folder)), encoding="utf-8")
+    (tmp_path / "tiny.yaml").write_text(
+        WORKFLOW.replace("CAPTURE", str(tiny_capture(Variant((16, 32))).folder)), encoding="utf-8"
+    )
     environment = {**os.environ, "PYTHONPATH": str(package.parent), "NUMBA_DISABLE_JIT": "1"}
 
     def pano_mvs(command: str, *options: str) -> str:

@@ -43,7 +43,7 @@ def check_same_bytes(ways: Mapping[str, Sequence[str]], capture: Path, folder: P
             sys.executable,
             *f"-m pano_mvs run quickstart --images {capture}".split(),
             *SMALL,
-            *["--set", "depth.planes=16", "--set", "views.sources=2"],
+            *["--set", "depth.planes=16", "--set", "views.sources=2", "--set", "images.max_width=256"],
             *options,
             *f"--out {folder / f'out-{name}'} --cache {folder / f'cache-{name}'}".split(),
         ]

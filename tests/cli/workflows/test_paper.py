@@ -60,7 +60,7 @@ def test_a_workflow_can_say_what_the_paper_does(faithful: Path, tmp_path: Path, 
     assert metrics["parallax_deg"] > 2
 
 
-FEW_PLANES = ("--set", "features.max_keypoints=3000", "--set", "depth.planes=64")
+FEW_PLANES = ("--set", "features.max_keypoints=3000", "--set", "depth.planes=48")
 
 
 @pytest.fixture

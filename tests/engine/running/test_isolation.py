@@ -197,8 +197,7 @@ open({str(pids)!r}, "a").write(f"{{child.pid}} ")"""
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not show what left the group of a process")
 @pytest.mark.parametrize(
     ("way", "end"),  # nothing connects a command without environment with a worker that has died
-    [(way, end) for end in ("run", "timeout", "SIGTERM", "SIGKILL") for way in ("daemon", "command")]
-    + [("daemon", "death")],
+    [("command", "run"), ("command", "timeout"), ("daemon", "SIGTERM"), ("command", "SIGKILL"), ("daemon", "death")],
 )
 def test_processes_of_other_sessions_end_with_the_run(toy: Toy, way: str, end: str) -> None:
     """A child that had left the process group of its worker outlived the run."""
