@@ -238,25 +238,26 @@ def test_commands_write_nothing_for_hostile_names(blocks: Path, tmp_path: Path) 
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("name", HOSTILE_NAMES[:4])
-def test_hostile_names_in_run_json_name_no_file(blocks: Path, tmp_path: Path, name: str) -> None:
+def test_hostile_names_in_run_json_name_no_file(blocks: Path, tmp_path: Path) -> None:
     """A preview of any name was copied into the result of `merge`."""
+    names = HOSTILE_NAMES[:4]
     runs = tmp_path / "deep" / "runs"
     shutil.copytree(blocks, runs)
     (tmp_path / "secret.png").write_bytes(SECRET)
     block = runs / "block_0"
     value = json.loads((block / "run.json").read_bytes())
-    value["views"][0] |= {"preview": name}
-    value["views"].append({"name": name, "preview": name})
-    value["poses"]["registered"] += [name]
-    value["poses"]["rejected"] = value["poses"]["doubts"] = {name: "it repeats"}
-    value["files"] = value["left_over"] = {name: "0" * 64}
-    value["failures"] = [{"stage": "images", "item": name, "cause": "it is damaged", "log": name}]
+    for view, name in zip(value["views"], names, strict=False):
+        view |= {"preview": name}
+    value["views"] += [{"name": name, "preview": name} for name in names]
+    value["poses"]["registered"] += names
+    value["poses"]["rejected"] = value["poses"]["doubts"] = dict.fromkeys(names, "it repeats")
+    value["files"] = value["left_over"] = dict.fromkeys(names, "0" * 64)
+    value["failures"] = [{"stage": "images", "item": name, "cause": "it is damaged", "log": name} for name in names]
     value["stages"] = [{"name": "images", "use": "source.folder", "params": {"path": str(runs)}}]
     (block / "run.json").write_text(json.dumps(value))
     outside = contents(tmp_path)
     run = load(block)
-    assert [run.views[view].image for view in (name,)] == [None]
+    assert [run.views[view].image for view in names] == [None] * len(names)
     assert all(view.preview is None and view.image is None for view in run.views.values())
     merged, page = runs / "merged", runs / "page"
     merge_outputs([block, runs / "block_1"], merged)
