@@ -54,6 +54,7 @@ def extent_mm(files: Files) -> tuple[float, float]:
     return float(np.ptp(columns)) / DPI * INCH, float(np.ptp(rows)) / DPI * INCH
 
 
+@pytest.mark.slow
 def test_the_sheet_is_at_its_scale_and_states_sizes(tmp_path: Path) -> None:
     files, ctx = planned(tmp_path, sheets=("pdf", "svg", "png"), title="The flat", room_names={"2.jpg": "Bath"})
     kinds = {f"storey_0_{kind}.{suffix}" for kind in ("sheet", "ceiling_sheet") for suffix in ("svg", "png")}
@@ -194,6 +195,7 @@ def test_a_turned_plan_lies_along_the_paper_and_north_turns_with_it(tmp_path: Pa
     assert np.arctan2(across, up) == pytest.approx(turn, abs=0.15)
 
 
+@pytest.mark.slow
 def test_the_plan_is_not_mirrored_and_the_ceiling_lies_over_it(tmp_path: Path) -> None:
     """The notch of the L is in the upper right corner; the ceiling has a red patch in the lower right one."""
     room = room_cloud(density=2000)
