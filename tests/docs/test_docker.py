@@ -123,7 +123,7 @@ def test_the_steps_give_a_program_that_runs(tmp_path: Path) -> None:
     command = shlex.split(pip_install().replace("/src", source.as_posix()))
     offline = ["--no-deps", "--no-build-isolation", "--no-index"]
     assert command[0] == "pip"
-    pip = [sys.executable, "-m", "pip", "--python", scripts / "python", *command[1:], *offline]
+    pip: list[str | Path] = [sys.executable, "-m", "pip", "--python", scripts / "python", *command[1:], *offline]
     installed = subprocess.run(pip, env=environment, capture_output=True)
     assert installed.returncode == 0, installed.stdout + installed.stderr
     shutil.rmtree(source)
