@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from hatch_build import entry_points_of, packages_of
-from tests.test_wheel import ROOT, below, build
+from tests.test_wheel import ROOT, below, built_once
 
 pytestmark = pytest.mark.slow
 
 
-def test_the_wheel_holds_the_bundled_plugins_and_their_entry_points(tmp_path: Path) -> None:
-    with zipfile.ZipFile(build(ROOT, "wheel", tmp_path)) as archive:
+def test_the_wheel_holds_the_bundled_plugins_and_their_entry_points(of_all_processes: Path) -> None:
+    with zipfile.ZipFile(built_once("wheel", of_all_processes)) as archive:
         names = set(archive.namelist())
         (listed,) = (name for name in names if name.endswith("entry_points.txt"))
         parser = ConfigParser(delimiters="=")
@@ -32,7 +32,7 @@ def test_the_wheel_holds_the_bundled_plugins_and_their_entry_points(tmp_path: Pa
         assert dict(parser[group]) == entries
 
 
-def test_the_source_distribution_holds_the_plugins(tmp_path: Path) -> None:
-    with tarfile.open(build(ROOT, "sdist", tmp_path)) as archive:
+def test_the_source_distribution_holds_the_plugins(of_all_processes: Path) -> None:
+    with tarfile.open(built_once("sdist", of_all_processes)) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {f"plugins/{name}" for name in below(ROOT / "plugins", "*.py")} <= names

@@ -116,13 +116,15 @@ def test_the_steps_give_a_program_that_runs(tmp_path: Path) -> None:
                 shutil.copy(ROOT / name, place)
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PANO_MVS_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(cache), "MPLCONFIGDIR": str(cache / "matplotlib"), "COLUMNS": "200"}
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, env=environment)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True, env=environment)
     scripts = tmp_path / "venv" / ("Scripts" if sys.platform == "win32" else "bin")
     paths = sysconfig.get_paths(vars={"base": str(tmp_path / "venv"), "platbase": str(tmp_path / "venv")})
     (Path(paths["purelib"]) / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"])
     command = shlex.split(pip_install().replace("/src", source.as_posix()))
     offline = ["--no-deps", "--no-build-isolation", "--no-index"]
-    installed = subprocess.run([scripts / command[0], *command[1:], *offline], env=environment, capture_output=True)
+    assert command[0] == "pip"
+    pip: list[str | Path] = [sys.executable, "-m", "pip", "--python", scripts / "python", *command[1:], *offline]
+    installed = subprocess.run(pip, env=environment, capture_output=True)
     assert installed.returncode == 0, installed.stdout + installed.stderr
     shutil.rmtree(source)
 
@@ -136,7 +138,6 @@ def test_the_steps_give_a_program_that_runs(tmp_path: Path) -> None:
 
     assert re.search(r"\d+\.\d+", call("--version"))
     assert "run" in call(*json.loads(only("CMD")))
-    assert "no mistakes" in call("check", "quickstart")
     call("run", "quickstart", "--until", "images")
     where = subprocess.run(
         [scripts / "python", "-c", "import pano_mvs; print(pano_mvs.__file__)"],

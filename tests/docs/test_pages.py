@@ -142,7 +142,8 @@ def test_nothing_of_a_bearer_is_left_in_any_output(pano_mvs: Command, capture: P
     text = block("masks.md", "workflow")
     workflow.write_text(text.replace("photos", str(capture / "images")), encoding="utf-8")
     result = pano_mvs(
-        "run", workflow, "--out", "out", "--set", "depth.planes=32", "--set", "features.max_keypoints=1500"
+        *("run", workflow, "--out", "out", "--set", "depth.planes=32", "--set", "features.max_keypoints=1500"),
+        *("--set", "views.sources=2"),
     )
     assert result.code == 0, result.text
     for path in sorted(Path("out/range").iterdir()):

@@ -166,7 +166,7 @@ def test_the_pose_solver_runs_in_its_workflow(solver: Path, tmp_path: Path, monk
     (tmp_path / "room" / "images").rename(tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
-    result = CliRunner().invoke(app, ["run", "mine.yaml", "--set", "depth.planes=16"])
+    result = CliRunner().invoke(app, ["run", "mine.yaml", "--until", "colmap"])
     assert result.exit_code == 0, result.output
     scored = CliRunner().invoke(app, ["evaluate", "poses", "out/mine", "--truth", "room/truth", "--json"])
     assert scored.exit_code == 0, scored.output

@@ -21,7 +21,15 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SAMPLE = ROOT / "workflows" / "samples" / "classroom" / "images"
 NAMES = ("hall.jpg", "kitchen.jpg", "lobby.jpg", "stairs.jpg")
-SMALLER = {"images.max_width": 512, "depth.planes": 48, "features.max_keypoints": 3000}
+SMALLER = {
+    "images.max_width": 256,
+    "depth.planes": 24,
+    "features.max_keypoints": 2000,
+    "weak.learned": "never",
+    "scene_planes.min_share": 0.1,
+}
+OF_SAMPLE = {"images.max_width": 416}  # has the pixel that is inspected
+MISSING = {"quickstart": ("scene_planes",), "known_poses": ("scene_planes", "weak")}  # stages
 NOT_RUN = ("pip", "docker", "pytest", "activate")
 
 
@@ -44,10 +52,10 @@ def smaller(arguments: list[str]) -> list[str]:
         return [*arguments, "--screenshot", "view.png"]
     if arguments[0] not in ("run", "tour"):
         return arguments
-    given = [f"{name}={value}" for name, value in SMALLER.items()]
-    if arguments[1] == "known_poses":
-        given = [setting for setting in given if not setting.startswith("features")]
-    given += ["textured.texture_px=1024"] if arguments[0] == "tour" else []
+    settings = SMALLER | (OF_SAMPLE if arguments[1] == "quickstart" else {})
+    missing = MISSING.get(arguments[1], ())
+    given = [f"{name}={value}" for name, value in settings.items() if name.partition(".")[0] not in missing]
+    given += ["textured.texture_px=512", "textured.cell=0.1"] if arguments[0] == "tour" else []
     quiet = ["--no-open"] if arguments[0] == "tour" else []
     return [*arguments, *quiet, *(word for setting in given for word in ("--set", setting))]
 
@@ -92,4 +100,4 @@ def check_python() -> None:
     names: dict[str, Any] = {"smaller": run}
     exec(found[1].replace("pano_mvs.run(", "smaller("), names)
     assert names["run"].summary.units.run == 0
-    assert names["range_map"].shape == (256, 512)
+    assert names["range_map"].shape == (128, 256)

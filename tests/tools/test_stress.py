@@ -43,12 +43,12 @@ def test_hostile_files_of_a_kind(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.slow
 def test_hostile_files_take_little_memory_and_end_no_run() -> None:
-    assert hostile.main(60) == 0
+    assert hostile.main(31) == 0
 
 
 @pytest.mark.slow
 def test_much_damage_is_healed_by_processes() -> None:
-    assert damage.main(40) == 0
+    assert damage.main(25) == 0
 
 
 def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
@@ -60,9 +60,8 @@ def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", ["processes", "serial"])
-def test_killed_runs_lose_nothing(executor: str) -> None:
-    assert kills.main(3, executor=executor) == 0
+def test_killed_runs_lose_nothing() -> None:
+    assert kills.main(3) == 0
 
 
 def test_a_hundred_tries_meet_each_fault_and_each_stage() -> None:
@@ -93,6 +92,6 @@ def test_nothing_is_lost_whatever_happens_around_a_run(clean: faults.Clean, tmp_
 
 @pytest.mark.slow
 def test_bad_items_killed_workers_and_a_full_disk_cost_the_bad_items_alone(tmp_path: Path) -> None:
-    verdict = load.load(tmp_path, count=20, bad=10, kills=2, every_s=1.0)
+    verdict = load.load(tmp_path, count=20, bad=10, kills=1, every_s=1.0)
     assert verdict.wrong == []
     assert verdict.runs >= 2  # the first one found the disk full

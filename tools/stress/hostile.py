@@ -26,6 +26,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -186,11 +187,25 @@ def faults_in_process(count: int, seed: int, scratch: Path) -> list[str]:
 
 
 def faults_of_kind(kind: str, count: int, scratch: Path) -> list[str]:
-    """Read all crafted inputs of a kind and some mutations in this process; return the faults."""
-    good = samples(scratch)
-    drawn = [case for case in cases(count * len(good), 0, scratch) if case.kind == kind]
-    found = [(case.name, fault(case, good[kind], scratch / f"{number}")) for number, case in enumerate(drawn)]
+    """Read some mutations of a kind in this process; return the faults. `main` reads the crafted inputs."""
+    sample, drawn = _samples_once()[kind], list(_mutations(_samples_once(), count, kind))
+    found = [(case.name, fault(case, sample, scratch / f"{number}")) for number, case in enumerate(drawn)]
     return [f"{name}\n{text}" for name, text in found if text]
+
+
+@cache
+def _samples_once() -> dict[str, Sample]:
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-hostile-") as name:
+        return samples(Path(name))
+
+
+def _mutations(good: Mapping[str, Sample], count: int, kind: str) -> Iterator[Case]:
+    """Yield as many mutations of one kind, which do not depend on the other kinds."""
+    rng, sample = random.Random(kind), good[kind]
+    for number in range(count):
+        file = rng.choice(list(sample.files)[: sample.mutated])
+        data, what = mutated(sample.files[file], rng)
+        yield Case(f"{number}: {kind}/{file}: {what}", kind, dict(sample.files) | {file: data})
 
 
 def serve(count: int, seed: int, scratch: Path, first: int, extra_bytes: int) -> None:

@@ -59,6 +59,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             library = write_library(folder / f"shared lib {version}", version)
             installed = install_plugin(write_plugin(folder / name, name, library))
             assert (installed.environment, installed.stages) == ("overlay", (f"export.{name}",))
+        images = sorted((tiny_capture(Variant((32, 64))).folder / "images").iterdir())
+        (folder / "photos").mkdir()
+        for path in images[:2]:
+            shutil.copy(path, folder / "photos")
         yield folder
 
 
@@ -66,8 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def installed(made: Path, pano_mvs: Command, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the two plugins; the current folder has a workflow that uses both."""
     monkeypatch.setenv("PANO_MVS_ENVIRONMENTS", str(made / "environments"))
-    images = tiny_capture(Variant((32, 64))).folder / "images"
-    Path("wf.yaml").write_text(WORKFLOW.format(images=images))
+    Path("wf.yaml").write_text(WORKFLOW.format(images=json.dumps(str(made / "photos"))))
     return made
 
 
@@ -88,19 +91,18 @@ def test_two_versions_of_a_library_work_in_one_run(installed: Path, pano_mvs: Co
     assert not {"shared_lib", "one", "two"} & set(sys.modules)
     again = pano_mvs("run", "wf.yaml", "--executor", "serial")
     assert "0 units computed" in again.flat
+    no_processes_in(installed)
     for executor in ("processes", "dask"):
-        other = pano_mvs("run", "wf.yaml", "--executor", executor, "--cache", executor, "--out", f"out/{executor}")
+        own = ("--executor", executor, "--workers", "1")
+        other = pano_mvs("run", "wf.yaml", *own, "--cache", executor, "--out", f"out/{executor}")
         assert other.code == 0, other.text
         assert {n: t for n, t in deliverables(Path("out", executor)).items() if n.endswith(".txt")} == found
-    isolated = pano_mvs("run", "wf.yaml", "--executor", "processes", "--isolate", "--cache", "i", "--out", "out/i")
-    assert isolated.code == 0, isolated.text
-
-
-def test_no_process_of_an_environment_is_left(installed: Path, pano_mvs: Command) -> None:
-    assert pano_mvs("run", "wf.yaml", "--executor", "serial").code == 0
-    assert pano_mvs("run", "wf.yaml", "--executor", "processes", "--cache", "other").code == 0
-    listed = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
-    assert str(installed / "environments") not in listed
+        no_processes_in(installed)
+    isolated = ("--executor", "processes", "--isolate", "--set", "two=null", "--cache", "i", "--out", "out/i")
+    alone = pano_mvs("run", "wf.yaml", *isolated)
+    assert alone.code == 0, alone.text
+    by_one = {name: text for name, text in found.items() if name.startswith("one/")}
+    assert {name: text for name, text in deliverables(Path("out/i")).items() if name.endswith(".txt")} == by_one
 
 
 def test_what_is_wrong_is_said_as_of_any_stage(installed: Path, pano_mvs: Command) -> None:
@@ -112,7 +114,6 @@ def test_what_is_wrong_is_said_as_of_any_stage(installed: Path, pano_mvs: Comman
     for override, text in said.items():
         result = pano_mvs("check", "wf.yaml", "--set", override)
         assert (result.code, text in result.flat) == (2, True), result.text
-    assert pano_mvs("check", "wf.yaml", "--set", "one.text=fine").code == 0
     result = pano_mvs("run", "wf.yaml", "--executor", "serial", "--set", "one.text=bad")
     assert result.code == 3
     assert "failed one:000.png: photos/bad.jpg: cannot be used. Remove it" in result.flat
@@ -161,23 +162,23 @@ def test_a_broken_environment_is_found_and_made_again(installed: Path, pano_mvs:
     found = {one["what"]: one for one in json.loads(doctor.text)["findings"] if one["group"] == "plugins"}
     assert (found["one 1.0"]["state"], found["two 1.0"]["state"]) == ("warning", "ok")
     assert found["one 1.0"]["remedy"] == f"run `pano-mvs plugin install '{installed / 'one'}'`, which makes it again"
-    for executor in ("serial", "processes"):
-        result = pano_mvs("run", "wf.yaml", "--executor", executor, "--keep-going", "--cache", executor)
+    for own in (("--executor", "serial"), ("--executor", "processes", "--workers", "1")):
+        result = pano_mvs("run", "wf.yaml", *own, "--keep-going", "--cache", own[1])
         assert result.code == 3, result.text
         assert "failed one:000.png: the environment of the plugin one 1.0 cannot be used" in result.flat
         assert "which makes it again" in result.flat
         assert units(run_json(Path("out/wf")))["two"][0] > 0
     assert install_plugin("one").is_new  # the same digest, but it does not work
-    assert pano_mvs("run", "wf.yaml", "--executor", "serial").code == 0
+    assert not [found.problem for found in plugin_environments(check=True) if found.problem]
 
 
 def test_a_unit_that_takes_too_long_is_ended(installed: Path, pano_mvs: Command) -> None:
     install_plugin(write_plugin(installed / "slow", "slow", None, text=SLOW))
     try:
-        images = tiny_capture(Variant((32, 64))).folder / "images"
+        images = json.dumps(str(installed / "photos"))
         stages = f"images: {{use: source.folder, path: {images}}}\n  slow: {{use: export.slow, timeout_s: 2}}\n"
         Path("slow.yaml").write_text(f"pano_mvs: 1\nstages:\n  {stages}")
-        result = pano_mvs("run", "slow.yaml", "--executor", "processes", "--only", "slow:000.png")
+        result = pano_mvs("run", "slow.yaml", "--executor", "processes", "--workers", "1", "--only", "slow:000.png")
         assert result.code == 3, result.text
         assert "it took longer than timeout_s: 2, and was ended" in result.flat
         no_processes_in(installed)
@@ -248,10 +249,27 @@ BAD_PLUGINS = {
 }
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The environment of a plugin, before it is asked what it holds."""
+    folder = tmp_path_factory.mktemp("built")
+    build(folder / "environment", plugin_source(str(write_plugin(folder / "bad", "bad", None, text=PLAIN))), "overlay")
+    return folder / "environment"
+
+
 @pytest.mark.parametrize(("text", "why"), BAD_PLUGINS.values(), ids=BAD_PLUGINS)
 def test_a_plugin_that_cannot_have_an_environment_is_refused(
-    installed: Path, tmp_path: Path, text: str, why: str
+    installed: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, text: str, why: str
 ) -> None:
+    """Its environment is a copy of another one with the code of this plugin, which saves the work of pip."""
+
+    def copied(folder: Path, *_: object) -> None:
+        shutil.copytree(built, folder, symlinks=True)
+        (package,) = folder.rglob("bad/__init__.py")
+        package.write_text(text)
+        shutil.rmtree(package.with_name("__pycache__"), ignore_errors=True)
+
+    monkeypatch.setattr("pano_mvs_environments.install.build", copied)
     before = sorted((installed / "environments").iterdir()), (installed / "environments/environments.json").read_text()
     with pytest.raises(InputError) as raised:
         install_plugin(write_plugin(tmp_path / "bad", "bad", None, text=text))
@@ -276,7 +294,7 @@ def test_requirements_that_cannot_be_met_are_said_with_the_reason_of_pip(
     result = pano_mvs("plugin", "install", tmp_path / "bad")
     assert (result.code, "ZeroDivisionError" in result.text) == (2, True), result.text
     assert {one.name for one in environments()} == {"one", "two"}
-    assert pano_mvs("run", "wf.yaml", "--executor", "serial").code == 0
+    assert all(Path(one.python).exists() for one in environments())
 
 
 def library_uri(folder: Path) -> str:
@@ -334,7 +352,7 @@ def read(item: SourceItem, params: ListedParams) -> Panorama:
 
 def test_a_source_lists_its_items_in_its_own_process(installed: Path, tmp_path: Path, pano_mvs: Command) -> None:
     install_plugin(write_plugin(tmp_path / "listed", "listed", None, text=SOURCE))
-    shutil.copytree(tiny_capture(Variant((32, 64))).folder / "images", "photos")
+    shutil.copytree(installed / "photos", "photos")
     Path("listed.yaml").write_text(
         "pano_mvs: 1\nstages:\n  images: {use: source.listed, path: photos}\n  one: {use: export.one}\n"
     )
@@ -355,27 +373,6 @@ def test_a_source_lists_its_items_in_its_own_process(installed: Path, tmp_path: 
         assert (result.code, "wf.yaml: is not a folder. Correct the path" in result.flat) == (2, True), result.text
     finally:
         product.remove_plugin("listed")
-
-
-def test_plugin_new_writes_a_package_that_is_installed(
-    installed: Path, pano_mvs: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PIP_NO_BUILD_ISOLATION", "0")  # pip reads this as a yes; hatchling is installed here
-    assert pano_mvs("plugin", "new", "filter", "mine", "--environment", "overlay").code == 0
-    result = pano_mvs("plugin", "install", "mine", "--json")
-    assert result.code == 0, result.text
-    found = json.loads(result.text)
-    assert (found["name"], found["environment"], found["stages"]) == ("mine", "overlay", ["filters.mine"])
-    try:
-        python = next(one.python for one in environments() if one.name == "mine")
-        tests = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "mine/test_mine.py"]
-        done = subprocess.run(tests, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": ""})
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "filters.mine version 1 from mine 0.1.0" in pano_mvs("stage", "show", "filters.mine").flat
-    finally:
-        result = pano_mvs("plugin", "remove", "mine", "--json")
-    assert json.loads(result.text)["folder"] == found["folder"]
-    assert not Path(found["folder"]).exists()
 
 
 def test_an_isolated_environment_sees_pano_mvs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -446,12 +443,30 @@ def test_stages_in_environments_have_the_code_that_they_have_there(installed: Pa
 
 
 def test_the_commands_in_the_guide_work(installed: Path, pano_mvs: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package that `plugin new` writes is installed, passes its own tests there, and is removed."""
     monkeypatch.setenv("PIP_NO_BUILD_ISOLATION", "0")  # pip reads this as a yes; hatchling is installed here
-    commands = block("plugins.md", "environment").splitlines()
-    assert [command.split()[:3] for command in commands][1] == ["pano-mvs", "plugin", "install"]
+    commands = [command.split()[1:] for command in block("plugins.md", "environment").splitlines()]
+    assert [command[:2] for command in commands][:2] == [["plugin", "new"], ["plugin", "install"]]
     for command in commands:
-        result = pano_mvs(*command.split()[1:])
+        as_json = ["--json"] if command[:2] in (["plugin", "install"], ["plugin", "remove"]) else []
+        result = pano_mvs(*command, *as_json)
         assert result.code == 0, result.text
-        if "doctor" in command:
+        if command[:2] == ["plugin", "install"]:
+            made = json.loads(result.text)
+            assert (made["name"], made["environment"], made["stages"]) == ("cut", "overlay", ["filters.cut"])
+            check_own_tests()
+        elif command[0] == "stage":
+            assert "filters.cut version 1 from cut 0.1.0" in result.flat
+        elif command[0] == "doctor":
             assert "1 stage in an environment of its own" in result.flat.replace("│", "").replace("  ", " ")
+    assert json.loads(result.text)["folder"] == made["folder"]
+    assert not Path(made["folder"]).exists()
     assert {one.name for one in environments()} == {"one", "two"}
+
+
+def check_own_tests() -> None:
+    """Run the tests that `plugin new` has written, in the environment of the package."""
+    python = next(one.python for one in environments() if one.name == "cut")
+    tests = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "cut/test_cut.py"]
+    done = subprocess.run(tests, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": ""})
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -65,6 +65,7 @@ def volume(product: Any) -> float:
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # of ifcopenshell's own rules
+@pytest.mark.slow
 def test_the_model_is_valid_and_holds_rooms_walls_and_openings(tmp_path: Path) -> None:
     model = written(tmp_path, the_sheet())
     logger: Any = json_logger()  # type: ignore[no-untyped-call]

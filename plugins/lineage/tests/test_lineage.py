@@ -28,7 +28,7 @@ from pano_mvs.session.code_listing import read_code_listing, write_code_listing
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import RunOptions
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy
+from tests.engine.conftest import Toy, toy_in
 
 
 def run_into(toy: Toy, out: str, *overrides: str) -> Path:
@@ -38,10 +38,24 @@ def run_into(toy: Toy, out: str, *overrides: str) -> Path:
     return session.out
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Toy, Path, Path]:
+    """Two runs of the toy workflow that differ in one setting; beside their folder is a copy of it."""
+    folder = tmp_path_factory.mktemp("made") / "toy"
+    folder.mkdir()
+    toy = toy_in(folder)
+    found = toy, run_into(toy, "first"), run_into(toy, "second", "scaled.by=4")
+    shutil.copytree(folder, folder.with_name("kept"))
+    return found
+
+
 @pytest.fixture
-def two(toy: Toy) -> tuple[Toy, Path, Path]:
-    """Two runs of the toy workflow that differ in one setting."""
-    return toy, run_into(toy, "first"), run_into(toy, "second", "scaled.by=4")
+def two(made: tuple[Toy, Path, Path]) -> tuple[Toy, Path, Path]:
+    """The two runs as they were made, in the same folder for each test, since they hold absolute paths."""
+    folder = made[0].folder
+    shutil.rmtree(folder)
+    shutil.copytree(folder.with_name("kept"), folder)
+    return made
 
 
 def test_runs_are_listed_with_the_settings_in_which_they_differ(two: tuple[Toy, Path, Path]) -> None:
@@ -551,8 +565,11 @@ def test_ranges_are_compared_by_class_and_by_solid_angle() -> None:
 
 
 @pytest.mark.slow
-def test_two_real_runs_are_compared_with_poses_and_ranges(rendered: Path, tmp_path: Path) -> None:
-    for name, planes in (("first", 32), ("second", 48)):
+def test_two_real_runs_are_compared_with_poses_and_ranges(
+    quickstart: tuple[Path, str], rendered: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(quickstart[0].with_name("cache"), tmp_path / "cache")  # which the first run only reads
+    for name, planes in (("first", 32), ("second", 24)):
         package.run(
             "quickstart",
             images=rendered / "images",

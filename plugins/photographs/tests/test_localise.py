@@ -138,6 +138,7 @@ def test_patches_do_not_confirm_another_room(model: Model) -> None:
     assert isinstance(localised(picture, model[0], focal_px=FOCAL_PX, patches=model[1]), str)
 
 
+@pytest.mark.slow
 def test_distortion_is_found(panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]) -> None:
     """The picture is distorted so that its content moves by up to 12 pixels."""
     picture, pose = taken

@@ -123,7 +123,7 @@ def test_temporary_results_are_dropped_and_computed_again(tmp_path: Path) -> Non
 
 def test_existing_cluster_gives_the_bytes_of_serial_and_lives_on(toy: Toy) -> None:
     serial = run_with(toy, SerialExecutor, name="serial")
-    with existing_cluster(toy.folder / "cluster") as (address, workers):
+    with existing_cluster(toy.folder / "cluster", workers=1) as (address, workers):
         for name in ("first", "second"):
             result = run_with(toy, lambda store: DaskExecutor(store, scheduler=address), name=name)
             assert told(result) == told(serial)
