@@ -91,14 +91,11 @@ def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:
 
 @pytest.mark.slow
 @ON_POSIX
-@pytest.mark.parametrize(
-    "number", ["SIGINT", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGTERM", "SIGHUP"))]
-)
-def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: str) -> None:
+def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy) -> None:
     hold = hold_means(toy)
     process = start(toy, "--executor", "processes", "--workers", "2")
     wait_for_means(toy, process, 2)
-    process.send_signal(signal.Signals[number])
+    process.send_signal(signal.SIGINT)
     _read_until(process, "2 units may finish within")
     hold.unlink()
     code, _, err = finish(process)
