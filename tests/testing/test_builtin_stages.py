@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ from _pytest.mark.structures import ParameterSet
 
 from pano_mvs.algorithms.learned import aliked
 from pano_mvs.algorithms.learned.aliked import level_tiles
+from pano_mvs.algorithms.structure import room_outlines
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.transforms_json import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene.files import LevelPanorama
@@ -22,6 +22,7 @@ from tests.synthetic.video_files import tiny_video
 SETTINGS: dict[str, dict[str, Any]] = {
     "export.floor_plan": {"formats": ["png", "svg", "dxf"]},
     "export.mesh": {"depth": 5},
+    "export.mesh_textured": {"triangles": 500, "texture_px": 256},  # cutting the surface open takes half of the time
     "depth.prior": {"network": str(GREY_NETWORK)},
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.localise": {"path": "{capture}/phone", "candidates": 1},  # each panorama takes 0.7 s
@@ -76,12 +77,16 @@ BUILTIN = contract_tests("pano_mvs.stages")
 assert len(BUILTIN) > 200
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_views() -> Iterator[None]:
-    """Let the network of key points look at three of its 16 views: each takes a quarter of a second."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(aliked, "level_tiles", lambda up: level_tiles(up)[:3])
-        yield
+@pytest.fixture(autouse=True)
+def less_work(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the network of key points look at one of its 16 views, and outlines of rooms have fewer distances.
+
+    In rolled pictures, a key point is found again in the view beside the one that it was in: those need three. No other
+    test uses results of theirs.
+    """
+    views = 3 if "rolls" in request.node.name else 1
+    monkeypatch.setattr(aliked, "level_tiles", lambda up: level_tiles(up)[:views])
+    monkeypatch.setattr(room_outlines, "_DISTANCES", room_outlines._DISTANCES[::4])
 
 
 @pytest.mark.parametrize("contract_test", BUILTIN)
