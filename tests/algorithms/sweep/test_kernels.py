@@ -7,7 +7,6 @@ from typing import Any, Literal
 import numba
 import numpy as np
 import pytest
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends import numba_backend
