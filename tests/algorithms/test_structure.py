@@ -183,7 +183,7 @@ def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     ("darker", "noise", "most"),
     [
         pytest.param(0.0, 3.0, 0.003, marks=pytest.mark.slow),
-        (10.0, 0.0, 0.012),
+        pytest.param(10.0, 0.0, 0.012, marks=pytest.mark.slow),
         pytest.param(None, 3.0, 0.005, marks=pytest.mark.slow),
     ],
     ids=["no creases, noise", "faint creases", "clear creases, noise"],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.learned import aliked, networks
 from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles, maxima_of_scores
 from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
-from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks, Provider
+from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features
@@ -73,16 +73,13 @@ def test_key_points_and_descriptors_are_those_of_pytorch(by_torch: Mapping[str, 
     assert np.quantile(cosines, 0.05) > 0.98
 
 
-@pytest.mark.parametrize("provider", ["cpu", "cuda"])
-def test_matches_are_those_of_pytorch(
-    by_torch: Mapping[str, Any], provider: Provider, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_matches_are_those_of_pytorch(by_torch: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch ran all layers without dropping key points; stopping early loses few matches.
 
     A processor also computes what is meant for graphics cards.
     """
     monkeypatch.setattr(networks, "_PROVIDERS", dict.fromkeys(("cpu", "cuda"), "CPUExecutionProvider"))
-    theirs = Networks(provider=provider)
+    theirs = Networks(provider="cuda")
     layer = theirs.load("lightglue_layer.onnx")
     seen = []
     for number in (0, 1):
