@@ -78,7 +78,7 @@ assert len(BUILTIN) > 200
 
 
 @pytest.fixture(autouse=True)
-def less_work(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def few_views(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the network of key points look at one of its 16 views, and outlines of rooms have fewer distances.
 
     In rolled pictures, a key point is found again in the view beside the one that it was in: those need three. No other
