@@ -18,15 +18,16 @@ from tests.algorithms.poses.synthetic_capture import features_from_bearings, noi
 
 Vector = tuple[float, float, float]
 
-SIZE_HW = (128, 256)
+SIZE_HW = (96, 192)
 WHOLE = np.ones(SIZE_HW, np.bool_)
 
 
 class RoomPictures(Sequence[NDArray[np.uint8]]):
     """Panoramas of the room that are rendered when they are first used, so that tests are collected quickly."""
 
-    def __init__(self, poses: Sequence[Rigid3]) -> None:
+    def __init__(self, poses: Sequence[Rigid3], size_hw: tuple[int, int]) -> None:
         self._poses = tuple(poses)
+        self._size_hw = size_hw
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -37,20 +38,20 @@ class RoomPictures(Sequence[NDArray[np.uint8]]):
     def __getitem__(self, idx: slice) -> list[NDArray[np.uint8]]: ...
     def __getitem__(self, idx: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
         if isinstance(idx, slice):
-            return [_picture(pose) for pose in self._poses[idx]]
-        return _picture(self._poses[idx])
+            return [_picture(pose, self._size_hw) for pose in self._poses[idx]]
+        return _picture(self._poses[idx], self._size_hw)
 
 
 @cache
-def _picture(pose: Rigid3) -> NDArray[np.uint8]:
-    return render(default_room(), pose, SIZE_HW)[0]
+def _picture(pose: Rigid3, size_hw: tuple[int, int]) -> NDArray[np.uint8]:
+    return render(default_room(), pose, size_hw)[0]
 
 
 @cache
-def room_capture() -> tuple[tuple[Rigid3, ...], RoomPictures]:
+def room_capture(size_hw: tuple[int, int] = SIZE_HW) -> tuple[tuple[Rigid3, ...], RoomPictures]:
     """Return five cameras about 0.6 apart and their panoramas."""
     poses = tuple(capture_poses(5, seed=1, spread=0.7))
-    return poses, RoomPictures(poses)
+    return poses, RoomPictures(poses, size_hw)
 
 
 def moved(pose: Rigid3, by: Vector) -> Rigid3:

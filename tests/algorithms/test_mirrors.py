@@ -40,9 +40,8 @@ def views_of(scene: Scene, *, phantom: bool) -> list[PlaneView]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_a_mirror_is_found_where_the_frame_ends(seed: int) -> None:
-    views = views_of(mirror_room(seed=seed, exposure=0.1), phantom=True)
+def test_a_mirror_is_found_where_the_frame_ends() -> None:
+    views = views_of(mirror_room(seed=0, exposure=0.1), phantom=True)
     (corners,) = find_mirrors(views, WALLS)
     # The frame is 8 cm wide; a cell is 2 cm.
     np.testing.assert_allclose(corners.min(axis=0), (*LOW_XY, 2.5), atol=0.15)

@@ -116,7 +116,7 @@ def test_pixels_move_to_the_walls_that_they_show(box: Box, planes: Structure) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("turn_deg", "ceiling_known"), [(0.0, True), (25.0, True), (25.0, False)])
+@pytest.mark.parametrize(("turn_deg", "ceiling_known"), [(0.0, True), (25.0, False)])
 def test_walls_without_any_match_stand_where_their_creases_are(turn_deg: float, *, ceiling_known: bool) -> None:
     """No view has a match on a wall, or on the ceiling: their ranges are the floor's and the ceiling's, spread out."""
     box = Box((256, 512), turn_deg)
@@ -180,27 +180,21 @@ def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
 
 
 @pytest.mark.parametrize(
-    ("darker", "noise"),
+    ("darker", "noise", "most"),
     [
-        pytest.param(0.0, 3.0, marks=pytest.mark.slow),
-        (10.0, 0.0),
-        pytest.param(0.0, 0.0, marks=pytest.mark.slow),
-        pytest.param(10.0, 3.0, marks=pytest.mark.slow),
+        pytest.param(0.0, 3.0, 0.003, marks=pytest.mark.slow),
+        pytest.param(10.0, 0.0, 0.012, marks=pytest.mark.slow),
+        pytest.param(None, 3.0, 0.005, marks=pytest.mark.slow),
     ],
-    ids=["no creases, noise", "faint creases", "no creases", "faint creases, noise"],
+    ids=["no creases, noise", "faint creases", "clear creases, noise"],
 )
-def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float, noise: float) -> None:
-    """One faint edge counted as the crease with the floor and as a skirting board."""
+def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float | None, noise: float, most: float) -> None:
+    """One faint edge counted as the crease with the floor and as a skirting board.
+
+    Its ranges are exact and weak; a tenth of a degree, a seventh of a pixel, is 0.4 % of its height.
+    """
     views, planes = _plain_ceiling(_noisy_box(noise, darker), 1.0)
-    assert moved_ceilings(views, planes)[1].y == pytest.approx(-HALF[1], rel=0.012 if darker else 0.003)
-
-
-@pytest.mark.slow
-def test_a_plain_ceiling_stays_where_creases_are_clear() -> None:
-    """Its ranges are exact and weak; a tenth of a degree, a seventh of a pixel, is 0.4 % of its height."""
-    structure = _noisy_box(3.0, None).structure()
-    above = structure.normals_in_world[:, 1] > 0.5
-    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.005)
+    assert moved_ceilings(views, planes)[1].y == pytest.approx(-HALF[1], rel=most)
 
 
 def _noisy_box(noise: float, darker: float | None) -> Box:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec, spiral_rays
+from tests.geometry.strategies import FEW
 
 BACK = rotation_from_rotvec(np.array([0.02, np.pi - 0.03, 0.01]))
 
@@ -107,6 +108,7 @@ def ray(angle: float, azimuth: float) -> tuple[float, float, float]:
     return np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)
 
 
+@FEW
 @given(ANGLES, AZIMUTHS, st.floats(0.01, 100))
 def test_rays_of_any_length_survive_the_round_trip_also_beyond_90_degrees(
     angle: float, azimuth: float, length: float
@@ -115,6 +117,7 @@ def test_rays_of_any_length_survive_the_round_trip_also_beyond_90_degrees(
     assert LENS.ray_from_pixel(pixel) == pytest.approx(ray(angle, azimuth), abs=1e-11)
 
 
+@FEW
 @given(ANGLES)
 def test_the_slope_is_the_derivative_of_the_radius(angle: float) -> None:
     h = 1e-6

@@ -20,7 +20,7 @@ from pano_mvs.geometry import (
     ray_from_pixel,
     rotation_from_rotvec,
 )
-from tests.geometry.strategies import RIGIDS, ROTATIONS, UNITS
+from tests.geometry.strategies import FEW, RIGIDS, ROTATIONS, UNITS
 
 # No square, and its axis not in the middle: a mix-up of width and height, or of x and y, shows.
 AHEAD = PinholeView(np.eye(3), 50.0, np.array([30.0, 22.0]), (40, 64))
@@ -44,6 +44,7 @@ def test_the_calibration_matrix_projects_as_the_view_does() -> None:
     assert AHEAD.calibration[1, 0] == AHEAD.calibration[0, 1] == 0
 
 
+@FEW
 @given(ROTATIONS, st.floats(-20, 90), st.floats(-20, 60), st.floats(0.1, 10))
 def test_pixels_survive_the_round_trip_at_any_distance(
     rotation: NDArray[np.float64], x: float, y: float, distance: float
@@ -120,14 +121,14 @@ def test_rays_are_those_of_colmap(place: str) -> None:
 
 
 @given(st.floats(0, WIDTH), st.floats(0, HEIGHT))
-@settings(max_examples=200)
+@settings(max_examples=80)
 def test_rays_are_those_of_colmap_anywhere(x: float, y: float) -> None:
     ray = CAMERA.cam_ray_from_img(np.array([x, y]))
     assert ray_from_pixel((x, y), (HEIGHT, WIDTH)) == pytest.approx(ray, abs=1e-15)
 
 
 @given(UNITS, st.floats(0.1, 100))
-@settings(max_examples=200)
+@settings(max_examples=80)
 def test_pixels_are_those_of_colmap_anywhere(ray: NDArray[np.float64], length: float) -> None:
     expected = CAMERA.img_from_cam((ray * length)[None])[0]
     got = pixel_from_ray(ray * length, (HEIGHT, WIDTH))
@@ -136,6 +137,7 @@ def test_pixels_are_those_of_colmap_anywhere(ray: NDArray[np.float64], length: f
     assert got[1] == pytest.approx(expected[1], abs=1e-9)
 
 
+@FEW
 @given(RIGIDS, UNITS)
 def test_transforms_and_quaternions_are_those_of_colmap(pose: Rigid3, point: NDArray[np.float64]) -> None:
     w, x, y, z = quat_wxyz_from_rotation(pose.rotation)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs import geometry
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import angle_between, pixel_from_ray, pixel_solid_angle, ray_from_pixel, ray_grid, spiral_rays
-from tests.geometry.strategies import ANGLES, SIZES, UNITS
+from tests.geometry.strategies import ANGLES, FEW, SIZES, UNITS
 
 SHARES = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.5, 1.0, 1e-12, 1 - 1e-12]))
 
@@ -40,6 +40,7 @@ def test_the_first_pixels_centre_is_at_one_half() -> None:
     np.testing.assert_array_equal(ray_grid((6, 12))[4, 7], ray_from_pixel((7.5, 4.5), (6, 12)))
 
 
+@FEW
 @given(SIZES, SHARES, SHARES)
 def test_azimuth_and_elevation_are_those_of_the_page(size: tuple[int, int], share_x: float, share_y: float) -> None:
     height, width = size
@@ -50,6 +51,7 @@ def test_azimuth_and_elevation_are_those_of_the_page(size: tuple[int, int], shar
     assert np.linalg.norm(ray) == pytest.approx(1, abs=1e-15)
 
 
+@FEW
 @given(UNITS)
 def test_the_inverse_is_that_of_the_page(ray: NDArray[np.float64]) -> None:
     x, y = pixel_from_ray(ray, (180, 360))
@@ -57,6 +59,7 @@ def test_the_inverse_is_that_of_the_page(ray: NDArray[np.float64]) -> None:
     assert np.radians(90 - y) == pytest.approx(np.arctan2(-ray[1], np.hypot(ray[0], ray[2])), abs=1e-12)
 
 
+@FEW
 @given(SIZES, UNITS, st.floats(1e-6, 1e6))
 def test_a_ray_of_any_length_survives_the_round_trip(
     size: tuple[int, int], ray: NDArray[np.float64], length: float
@@ -65,6 +68,7 @@ def test_a_ray_of_any_length_survives_the_round_trip(
     assert angle_between(back, ray) < 1e-12
 
 
+@FEW
 @given(SIZES, st.floats(1e-6, 1 - 1e-6), st.floats(1e-3, 1 - 1e-3))
 @example((512, 1024), 0.5, 0.5)
 def test_a_pixel_survives_the_round_trip(size: tuple[int, int], share_x: float, share_y: float) -> None:
@@ -72,6 +76,7 @@ def test_a_pixel_survives_the_round_trip(size: tuple[int, int], share_x: float, 
     assert pixel_from_ray(ray_from_pixel(pixel, size), size) == pytest.approx(pixel, abs=1e-9)
 
 
+@FEW
 @given(UNITS)
 def test_pixels_lie_within_the_picture(ray: NDArray[np.float64]) -> None:
     x, y = pixel_from_ray(ray, (7, 14))
@@ -79,6 +84,7 @@ def test_pixels_lie_within_the_picture(ray: NDArray[np.float64]) -> None:
     assert 0 <= y <= 7
 
 
+@FEW
 @given(SIZES)
 def test_solid_angles_sum_to_the_whole_sphere(size: tuple[int, int]) -> None:
     areas = pixel_solid_angle(size)
@@ -93,6 +99,7 @@ def test_solid_angle_of_a_pixel_is_the_integral_of_the_cosine() -> None:
     assert pixel_solid_angle((18, 36)) == pytest.approx(by_sum, rel=1e-8)
 
 
+@FEW
 @given(UNITS, UNITS, ANGLES)
 def test_angle_between_is_exact_near_zero_and_near_pi(
     first: NDArray[np.float64], second: NDArray[np.float64], angle: float

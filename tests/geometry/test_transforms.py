@@ -24,17 +24,19 @@ from pano_mvs.geometry import (
     similarity_from_points,
     skew,
 )
-from tests.geometry.strategies import ANGLES, POINTS, RIGIDS, ROTATIONS, SIMILARITIES, UNITS
+from tests.geometry.strategies import ANGLES, FEW, POINTS, RIGIDS, ROTATIONS, SIMILARITIES, UNITS
 
 CLOSE: dict[str, Any] = {"rel": 1e-9, "abs": 1e-8}
 
 
+@FEW
 @given(RIGIDS, POINTS)
 def test_a_rigid_transform_is_R_x_plus_t(pose: Rigid3, point: NDArray[np.float64]) -> None:
     assert pose.apply(point) == pytest.approx(pose.rotation @ point + pose.translation, **CLOSE)
     assert pose.apply([[point, 2 * point]])[0, 1] == pytest.approx(pose.apply(2 * point), **CLOSE)
 
 
+@FEW
 @given(RIGIDS, RIGIDS, RIGIDS, POINTS)
 def test_rigid_transforms_are_a_group(first: Rigid3, second: Rigid3, third: Rigid3, point: NDArray[np.float64]) -> None:
     assert ((first @ second) @ third).apply(point) == pytest.approx((first @ (second @ third)).apply(point), **CLOSE)
@@ -44,6 +46,7 @@ def test_rigid_transforms_are_a_group(first: Rigid3, second: Rigid3, third: Rigi
     assert (Rigid3.identity() @ first).apply(point) == pytest.approx(first.apply(point), **CLOSE)
 
 
+@FEW
 @given(RIGIDS)
 def test_the_centre_is_where_the_camera_stands(cam_from_world: Rigid3) -> None:
     assert cam_from_world.apply(cam_from_world.center) == pytest.approx(np.zeros(3), **CLOSE)
@@ -51,6 +54,7 @@ def test_the_centre_is_where_the_camera_stands(cam_from_world: Rigid3) -> None:
     assert again.translation == pytest.approx(cam_from_world.translation, **CLOSE)
 
 
+@FEW
 @given(SIMILARITIES, SIMILARITIES, SIMILARITIES, POINTS)
 def test_similarities_are_a_group(
     first: Similarity3, second: Similarity3, third: Similarity3, point: NDArray[np.float64]
@@ -62,6 +66,7 @@ def test_similarities_are_a_group(
     assert first.inverse().apply(first.apply(point)) == pytest.approx(point, rel=1e-9, abs=1e-6)
 
 
+@FEW
 @given(SIMILARITIES, RIGIDS, POINTS)
 def test_a_moved_camera_sees_the_moved_point_in_the_same_direction(
     world: Similarity3, cam_from_source: Rigid3, point: NDArray[np.float64]
@@ -73,6 +78,7 @@ def test_a_moved_camera_sees_the_moved_point_in_the_same_direction(
     assert center == pytest.approx(world.apply(cam_from_source.center), rel=1e-9, abs=1e-6)
 
 
+@FEW
 @given(SIMILARITIES, st.integers(3, 20), st.integers(0, 1000), st.booleans())
 def test_a_similarity_is_recovered_from_points(truth: Similarity3, count: int, seed: int, flat: bool) -> None:
     source = np.random.default_rng(seed).normal(size=(count, 3)) * (1, 1, 0 if flat else 1)
@@ -82,6 +88,7 @@ def test_a_similarity_is_recovered_from_points(truth: Similarity3, count: int, s
     assert found.apply(source) == pytest.approx(truth.apply(source), rel=1e-6, abs=1e-6)
 
 
+@FEW
 @given(ROTATIONS, POINTS, st.integers(0, 1000))
 def test_without_scale_the_best_rigid_motion_is_found(
     rotation: NDArray[np.float64], offset: NDArray[np.float64], seed: int
@@ -123,11 +130,13 @@ def is_rotation(matrix: NDArray[np.float64]) -> bool:
     return bool(matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(matrix) > 0)
 
 
+@FEW
 @given(POINTS, POINTS)
 def test_skew_is_the_cross_product(first: NDArray[np.float64], second: NDArray[np.float64]) -> None:
     assert skew(first) @ second == pytest.approx(np.cross(first, second), abs=1e-9)
 
 
+@FEW
 @given(UNITS, ANGLES)
 def test_rotation_vectors_survive_the_round_trip(axis: NDArray[np.float64], angle: float) -> None:
     rotation = rotation_from_rotvec(axis * angle)
@@ -139,6 +148,7 @@ def test_rotation_vectors_survive_the_round_trip(axis: NDArray[np.float64], angl
     assert rotation_from_rotvec(back) == pytest.approx(rotation, abs=1e-9)
 
 
+@FEW
 @given(UNITS, st.floats(-np.pi / 2, np.pi / 2))
 def test_a_rotation_turns_right_handedly_about_its_axis(axis: NDArray[np.float64], angle: float) -> None:
     across = np.cross(axis, (0.3, -0.5, 0.8))
@@ -146,6 +156,7 @@ def test_a_rotation_turns_right_handedly_about_its_axis(axis: NDArray[np.float64
     assert turned == pytest.approx(across * np.cos(angle) + np.cross(axis, across) * np.sin(angle), abs=1e-12)
 
 
+@FEW
 @given(ROTATIONS)
 def test_quaternions_survive_the_round_trip(rotation: NDArray[np.float64]) -> None:
     quat_wxyz = quat_wxyz_from_rotation(rotation)
@@ -171,6 +182,7 @@ def test_many_rotations_at_once_are_each_alone() -> None:
     assert rotation_from_quat_wxyz(quats) == pytest.approx(rotations)
 
 
+@FEW
 @given(ROTATIONS, UNITS, ANGLES)
 def test_geodesic_angle_is_that_of_the_turn_between(
     rotation: NDArray[np.float64], axis: NDArray[np.float64], angle: float
@@ -184,6 +196,7 @@ def test_geodesic_angle_keeps_small_angles() -> None:
     assert geodesic_angle(np.eye(3), rotation_from_rotvec((0, 1e-10, 0))) == pytest.approx(1e-10, rel=1e-5)
 
 
+@FEW
 @given(ROTATIONS, st.integers(0, 1000))
 def test_the_nearest_rotation_undoes_a_small_error(rotation: NDArray[np.float64], seed: int) -> None:
     noise = 1e-3 * np.random.default_rng(seed).normal(size=(3, 3))
@@ -192,11 +205,13 @@ def test_the_nearest_rotation_undoes_a_small_error(rotation: NDArray[np.float64]
     assert np.linalg.norm(found - rotation - noise) <= np.linalg.norm(noise) + 1e-15
 
 
+@FEW
 @given(ROTATIONS)
 def test_the_nearest_rotation_of_a_reflection_is_no_reflection(rotation: NDArray[np.float64]) -> None:
     assert is_rotation(nearest_rotation(rotation @ np.diag([1.0, 1.0, -0.5])))
 
 
+@FEW
 @given(UNITS, UNITS)
 @example(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]))
 @example(np.array([0.0, 0.0, 1.0]), np.array([3e-12, -4e-12, -1.0]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, triangulate_bearings
-from tests.geometry.strategies import RIGIDS, ROTATIONS, UNITS
+from tests.geometry.strategies import FEW, RIGIDS, ROTATIONS, UNITS
 
 
 def bearing(point_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -18,6 +18,7 @@ def bearing(point_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     return result
 
 
+@FEW
 @given(ROTATIONS, UNITS, st.floats(0.05, 1e4), st.floats(1e-3, np.pi - 1e-3), st.floats(0, 2 * np.pi))
 def test_ranges_are_recovered_from_beside_the_epipole_to_far_away(
     rotation: NDArray[np.float64], center: NDArray[np.float64], distance: float, off_axis: float, around: float
@@ -37,6 +38,7 @@ def test_ranges_are_recovered_from_beside_the_epipole_to_far_away(
     assert second == pytest.approx(np.linalg.norm(in_second), rel=tolerance, abs=tolerance)
 
 
+@FEW
 @given(RIGIDS, UNITS)
 def test_a_point_behind_has_a_negative_range(second_from_first: Rigid3, ray: NDArray[np.float64]) -> None:
     point = -2 * ray  # the first camera looks the other way
@@ -65,6 +67,7 @@ def test_parallel_rays_have_no_range() -> None:
         assert np.isnan(ranges_from_bearings(ray, ray, pose)).all()
 
 
+@FEW
 @given(st.lists(RIGIDS, min_size=2, max_size=5), UNITS, st.floats(0.5, 30))
 def test_points_are_recovered_from_many_cameras(
     cameras: list[Rigid3], direction: NDArray[np.float64], distance: float

@@ -24,7 +24,7 @@ from tools.benchmarks.equivariance import (
 )
 
 SMALL = ["depth.planes=48", "depth.near=1.0", "depth.far=6.0"]
-SIZE = (80, 160)
+SIZE = (64, 128)
 
 
 @pytest.fixture(scope="module")

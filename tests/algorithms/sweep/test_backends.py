@@ -33,11 +33,12 @@ from pano_mvs.testing.sweep_backends import CASES, agreement, share_alike, sweep
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numba", "opencv"])
 def test_every_backend_gives_the_winners_of_the_readable_one(backend: str) -> None:
-    shares = [agreement(number, backend) for number in range(CASES)]
-    assert np.mean(shares) >= 0.99
+    """Every third case: all costs, combinations and aggregations, though not all of them together."""
+    shares = {number: agreement(number, backend) for number in range(0, CASES, 3)}
+    assert np.mean(list(shares.values())) >= 0.99
     # From tiny pictures each backend's own rough ranges match exposures, to a grey level more or less.
-    assert min(shares) >= 0.95
-    assert min(share for number, share in enumerate(shares) if not sweep_case(number).settings.exposure) >= 0.97
+    assert min(shares.values()) >= 0.95
+    assert min(share for number, share in shares.items() if not sweep_case(number).settings.exposure) >= 0.97
 
 
 def test_bands_find_every_place_of_the_window() -> None:

@@ -211,7 +211,7 @@ def test_it_finds_what_the_plain_sweep_finds(settings: SweepSettings) -> None:
 
 @pytest.mark.slow
 def test_three_levels_are_not_much_worse_than_two() -> None:
-    pictures, poses, truth = _capture(256)
+    pictures, poses, truth = _capture(192)
     two, three = (_sweep(pictures, poses, PLAIN.replace(levels=levels)) for levels in (2, 3))
     assert _good(three.range, truth).mean() > _good(two.range, truth).mean() - 0.03
 
@@ -272,7 +272,7 @@ def test_only_the_compiled_backend_has_levels() -> None:
 
 @pytest.mark.slow
 def test_thin_rods_are_seen_where_the_plain_sweep_sees_them() -> None:
-    scene, size_hw = poles(seed=2), (192, 384)
+    scene, size_hw = poles(seed=2), (160, 320)
     views = [scene.view(idx, size_hw) for idx in range(3)]
     relative = [pose @ scene.poses[0].inverse() for pose in scene.poses[1:3]]
     bare = len(default_room().surfaces)

@@ -162,12 +162,8 @@ def test_no_cost_minds_another_exposure(capture: Capture, cost: str, exposure: b
 @pytest.mark.slow
 def test_all_names_go_together(capture: Capture) -> None:
     tiny = [picture[::4, ::4] for picture in capture[0]], capture[1], None
-    for names in itertools.islice(itertools.product(*NAMES.values()), 0, None, 5):  # has every pair of names
-        settings = dict(zip(NAMES, names, strict=True))
-        if [settings[name] for name in ("spacing", "no_match")] == ["inverse", "invalid"] or settings[
-            "cost"
-        ] == "census":
-            swept(tiny, planes=5, **settings).check()
+    for names in itertools.islice(itertools.product(*NAMES.values()), 0, None, 317):  # has every pair of names
+        swept(tiny, planes=5, **dict(zip(NAMES, names, strict=True))).check()
 
 
 def test_a_source_weighs_by_the_parallax_it_sees() -> None:

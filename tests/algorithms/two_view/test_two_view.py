@@ -127,8 +127,13 @@ def test_same_seed_same_bytes() -> None:
     assert views[0].matches_idx.tobytes() == views[1].matches_idx.tobytes()
 
 
-@pytest.mark.parametrize("count", [40, 150, 600, pytest.param(3000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("crowd", [0.0, 8.0])
+@pytest.mark.parametrize(
+    ("count", "crowd"),
+    [
+        *((count, crowd) for count in (40, 150, 600) for crowd in (0.0, 8.0)),
+        pytest.param(3000, 8.0, marks=pytest.mark.slow),
+    ],
+)
 def test_random_matches_have_no_geometry(count: int, crowd: float) -> None:
     """Also where key points crowd at the horizon, which makes chance agreement far more likely."""
     rng = rng_of(f"random {count} {crowd}")

@@ -108,10 +108,11 @@ def test_each_image_is_loaded_once_and_only_when_it_is_needed() -> None:
 
 def test_large_panoramas_are_judged_at_the_same_size(confirmation: Confirmation) -> None:
     large = {
-        idx: (np.repeat(np.repeat(one, 2, axis=0), 2, axis=1), np.ones((256, 512), np.bool_))
+        idx: (np.repeat(np.repeat(one, 2, axis=0), 2, axis=1), np.repeat(np.repeat(WHOLE, 2, axis=0), 2, axis=1))
         for idx, one in enumerate(PICTURES)
     }
-    judged = confirmation_of(large)
+    assert confirmation_of(large).small(0).image.shape == (128, 256, 3)
+    judged = confirmation_of(large).at_width(SIZE_HW[1])
     assert judged.small(0).image.shape == (*SIZE_HW, 3)
     expected = confirmation.share(0, POSES[0], CAMERAS)
     assert judged.share(0, POSES[0], CAMERAS) == pytest.approx(expected, abs=0.03)

@@ -74,10 +74,9 @@ def matches() -> Matches:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_matches", [False, True])
-def test_true_poses_stay_and_nobody_is_doubted(matches: Matches, with_matches: bool) -> None:
+def test_true_poses_stay_and_nobody_is_doubted(matches: Matches) -> None:
     given = displaced()
-    found = verified(given, matches if with_matches else None)
+    found = verified(given, matches)
     assert found.names == NAMES
     assert found.doubts == {}
     assert found.rejected == {}
@@ -91,14 +90,16 @@ def test_true_poses_stay_and_nobody_is_doubted(matches: Matches, with_matches: b
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
-def test_a_moved_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_bit(
-    matches: Matches, wrong: str
-) -> None:
-    given = displaced(wrong)
+def test_a_moved_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_bit(matches: Matches) -> None:
+    """Even the first one, in whose frame models grow; it is turned as well."""
+    wrong, turn = NAMES[0], rotation_from_rotvec([0.0, 0.3, 0.1])
+    away = moved(POSES[0], AWAY)
+    cameras = {**TRUTH, wrong: Rigid3.from_center(turn @ away.rotation, away.center)}
+    given = replace(poses_of(cameras), rejected={"x.png": "no pair"})
     found = verified(given, matches)
     assert found.names == NAMES
     assert found.doubts == {}
+    assert found.rejected == {"x.png": "no pair"}
     assert found.confirmed_shares is not None
     assert (found.confirmed_shares > 0.4).all()
     assert (found.frame, found.scale, found.metric) == ("site", "metres", True)
@@ -110,23 +111,9 @@ def test_a_moved_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_
 
 
 @pytest.mark.slow
-def test_a_turned_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_bit(matches: Matches) -> None:
-    turn = rotation_from_rotvec([0.0, 0.3, 0.1])
-    cameras = {**TRUTH, "2.png": Rigid3.from_center(turn @ POSES[2].rotation, POSES[2].center)}
-    given = replace(poses_of(cameras), rejected={"x.png": "no pair"})
-    found = verified(given, matches)
-    assert found.doubts == {}
-    assert found.rejected == {"x.png": "no pair"}
-    assert_at(found, "2.png", TRUTH["2.png"])
-    for name in set(NAMES) - {"2.png"}:
-        assert bytes_of(found, name) == bytes_of(given, name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("with_matches", [False, True])
-def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: Matches, with_matches: bool) -> None:
+def test_a_moved_camera_is_only_doubted_without_matches() -> None:
     given = displaced("2.png")
-    found = verified(given, matches, correct=False) if with_matches else verified(given)
+    found = verified(given)
     assert set(found.doubts) == {"2.png"}
     assert "what other images lead to expect there" in found.doubts["2.png"]
     assert verify_poses(given, load, features=None, two_views=None, miss_cost=1e-6).doubts == {}
@@ -262,7 +249,8 @@ def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
 
 @pytest.mark.slow
 def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
-    found = verify_poses(displaced(), lambda name: (np.full((*SIZE_HW, 3), 99, np.uint8), WHOLE))
+    plain = np.full((32, 64, 3), 99, np.uint8), np.ones((32, 64), np.bool_)
+    found = verify_poses(displaced(), lambda name: plain)
     assert found.doubts == {}
     assert found.confirmed_shares is not None
     assert np.isnan(found.confirmed_shares).all()
