@@ -34,8 +34,8 @@ from hypothesis import HealthCheck, settings
 
 from tests.plugin_packages import Packages, empty_doors, packages_in
 
-# How long it takes to draw an example depends on what else the machine does.
-settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# How long it takes to draw an example depends on what else the machine does. Laws that need more say so.
+settings.register_profile("untimed", deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 # A worker takes longer to start than most of the small runs in here take; tests of the executors name theirs.
 os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
