@@ -1,10 +1,10 @@
 """Compiled: sample one source for a band of rows of the reference at one depth hypothesis.
 
-A band is projected exactly in every eighth row and by cubic interpolation between; in low pictures, where eight rows are
-a large step on the sphere, it is projected exactly in all rows. The exact position costs two arc tangents. Along a column of the reference it is smooth but near the poles of the source: there, where four exact rows
-are bent too much (their third difference is large, and with it the fourth, of which a cubic between them misses 0.023),
-it is computed exactly. Rows, not columns, are skipped: a rolled picture then has the same positions, and the inner
-loops have no border.
+A band is projected exactly in every eighth row and by cubic interpolation between; low pictures, where eight rows are a
+large step on the sphere, are projected exactly in all rows. The exact position costs two arc tangents. Along a column
+of the reference it is smooth but near the poles of the source: there, where four exact rows are bent too much (their
+third difference is large, and with it the fourth, of which a cubic between them misses 0.023), it is computed exactly.
+Rows, not columns, are skipped: a rolled picture then has the same positions, and the inner loops have no border.
 
 Rows are computed in short separate loops (project, gather, blend) over arrays of one row: a loop that both gathers and
 stores cannot be proved free of aliasing, and is then not vectorised. Loop variables are unsigned, since numba checks
