@@ -6,6 +6,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from ruamel.yaml import YAML
 
 from pano_mvs.core.yaml_text import Problems
@@ -39,6 +40,7 @@ def flattened(preset: Path) -> dict[str, Any]:
     return {"pano_mvs": 1, "stages": {name: node.plain() for name, node in merged.stages.items()}}
 
 
+@pytest.mark.slow
 def test_presets_in_a_list_are_merged_as_without_groups(tmp_path: Path) -> None:
     """What extends several presets must find the results that it computed before presets had groups."""
     registry = Registry.installed()

@@ -237,6 +237,7 @@ def test_commands_write_nothing_for_hostile_names(blocks: Path, tmp_path: Path) 
     assert contents(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_hostile_names_in_run_json_name_no_file(blocks: Path, tmp_path: Path) -> None:
     """A preview of any name was copied into the result of `merge`."""
     names = HOSTILE_NAMES[:4]

@@ -141,6 +141,7 @@ def test_z_depths_are_the_true_ones_between_steps(panorama: View) -> None:
     assert np.mean(np.concatenate(errors) < 0.01) > 0.94
 
 
+@pytest.mark.slow
 @pytest.mark.kernel("ranges.kernels_agreement")
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_compiled_loop_is_the_plain_one(panorama: View, layout: FaceLayout) -> None:

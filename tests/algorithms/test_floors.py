@@ -51,6 +51,7 @@ def _floors(axes: WorldAxes, folder: Path, missing: int = 0) -> Structure:
     return floors_of_groups(poses, images, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_the_floor_is_found_in_small_sweeps(tmp_path: Path) -> None:
     found = _floors(WorldAxes.LEVEL, tmp_path)
     heights = found.offsets * found.normals_in_world[:, 1]

@@ -69,6 +69,7 @@ def at_full_size(views: Views, coarse: RangeMap, **settings: Any) -> RangeMap:
     return joined_strips(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strip_rows", [64, 100])
 def test_strips_change_nothing(views: Views, coarse: RangeMap, strip_rows: int) -> None:
     whole, stripped = (at_full_size(views, coarse, strip_rows=rows) for rows in (SIZE[0], strip_rows))

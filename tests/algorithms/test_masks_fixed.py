@@ -168,6 +168,7 @@ def test_margin_and_area(views: list[NDArray[np.uint8]]) -> None:
     assert not static_content(pictures, min_area_deg2=20_000).pixels.any()
 
 
+@pytest.mark.slow
 def test_sharpness_is_positive_only_where_structure_agrees_exactly(views: list[NDArray[np.uint8]]) -> None:
     shifted = [np.roll(views[0], columns, axis=1) for columns in (0, 1, 2)]
     middle = slice(64, 192)

@@ -64,6 +64,7 @@ def share(pixels: Mask, of: Mask) -> float:
     return share_of_sphere(pixels & of) / share_of_sphere(of)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outfit", ["shirt", "black"])
 @pytest.mark.parametrize("measured", [True, False], ids=["measured", "ground"])
 def test_the_operator_is_found(outfit: str, measured: bool) -> None:

@@ -86,6 +86,7 @@ def crowd(room: Picture, portrait: tuple[Picture, Mask]) -> tuple[Picture, dict[
     return picture, shown
 
 
+@pytest.mark.slow
 def test_people_are_found_and_nothing_else(crowd: tuple[Picture, dict[str, Mask]]) -> None:
     picture, shown = crowd
     found = people(picture)
@@ -95,6 +96,7 @@ def test_people_are_found_and_nothing_else(crowd: tuple[Picture, dict[str, Mask]
     assert share(found, ~around) < 0.01
 
 
+@pytest.mark.slow
 def test_passers_by_and_small_people_can_be_left_in(crowd: tuple[Picture, dict[str, Mask]]) -> None:
     picture, shown = crowd
     area_deg2 = float(AREA[shown["at a distance"]].sum()) * np.degrees(1) ** 2

@@ -104,6 +104,7 @@ def blue() -> Views:
     return outdoors("blue", turned=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sky", "turned"), [*((sky, True) for sky in SKIES), ("blue", False)])
 def test_skies_are_found(sky: str, turned: bool) -> None:
     views = outdoors(sky, turned=turned)

@@ -59,6 +59,7 @@ def test_paths_have_the_least_costs(step: tuple[int, int]) -> None:
     np.testing.assert_allclose(sums - 1, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_beam_is_told_from_the_ceiling_by_its_edges() -> None:
     """All ranges of ceiling and beam lie halfway between the two, as those of plain surfaces can in every view."""
     views = [render(ROOM, pose, SIZE, supersample=1) for pose in POSES]

@@ -137,6 +137,7 @@ def test_compiled_planes_equal_least_squares() -> None:
         np.testing.assert_allclose(planes[:, row, column], expected, rtol=2e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.kernel("patchmatch.kernels_refine", "patchmatch.kernels_match")
 @pytest.mark.parametrize("weighted", [False, True])
 def test_compiled_steps_equal_normal_equations(weighted: bool) -> None:

@@ -17,6 +17,7 @@ from tests.synthetic.drawn_rooms import COLORS, SIZE_HW, TILT, box, true_distanc
 ALL = np.ones(SIZE_HW, np.bool_)
 
 
+@pytest.mark.slow
 def test_a_plain_room_is_outlined_in_heights_of_the_camera() -> None:
     picture = box()
     lines = lines_of(picture, ALL)
@@ -30,6 +31,7 @@ def test_a_plain_room_is_outlined_in_heights_of_the_camera() -> None:
     assert np.median(outline.probabilities) > 0.8
 
 
+@pytest.mark.slow
 def test_the_camera_is_levelled_by_the_lines_of_its_picture() -> None:
     lines = lines_of(box(), ALL)
     up = lines.cam_from_level @ UP
@@ -50,6 +52,7 @@ def test_lines_along_walls_say_how_a_camera_is_tilted() -> None:
     assert np.degrees(np.arccos(turn @ UP @ (TILT @ UP))) < 0.2
 
 
+@pytest.mark.slow
 def test_the_frame_of_walls_is_upright_and_along_them() -> None:
     found = walls_of_picture(box(), ALL, UP)
     assert found is not None
@@ -79,6 +82,7 @@ def test_a_picture_without_walls_has_no_outline(picture: NDArray[np.uint8]) -> N
     assert np.isnan(outline.distances).all()
 
 
+@pytest.mark.slow
 def test_other_panoramas_say_how_high_the_ceiling_is() -> None:
     """What is painted like the ceiling looks like a lower one; the other rooms of the house have none."""
     clear, seen = box(), box().astype(np.float64)

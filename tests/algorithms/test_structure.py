@@ -170,6 +170,7 @@ def test_clarity_is_that_of_all_azimuths(half_window: int, monkeypatch: pytest.M
     np.testing.assert_allclose(found, sky.crease_clarity(distance, -1.6), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     """Its ranges are 6 % too large in all views."""
     views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.06)
@@ -333,6 +334,7 @@ def test_views_share_a_place_where_their_ranges_agree(box: Box) -> None:
     assert np.mean(found["shared"] == 1) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("red", [True, False])
 def test_what_is_not_confirmed_before_the_floor_stays_if_other_views_show_another_colour(
     planes: Structure, red: bool
@@ -351,6 +353,7 @@ def test_what_is_not_confirmed_before_the_floor_stays_if_other_views_show_anothe
     assert np.mean(np.abs(laid / expected - 1) < 0.01) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("red", [True, False])
 def test_a_plane_is_not_laid_where_the_others_see_something_else_behind_it(
     box: Box, planes: Structure, *, red: bool
@@ -372,6 +375,7 @@ def test_a_plane_is_not_laid_where_the_others_see_something_else_behind_it(
     assert np.mean(np.abs(laid / expected - 1) < 0.01) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deep", [1.4, np.nan])
 def test_nothing_lies_below_the_floor(box: Box, planes: Structure, deep: float) -> None:
     """A view that confirms nothing sees its floor too deep, or not at all; the other views see it."""

@@ -57,6 +57,7 @@ def test_input_that_cannot_be_used(pano_mvs: Command, short: Path, capture: Path
     assert what in result.flat
 
 
+@pytest.mark.slow
 def test_bad_pictures_among_good_ones(pano_mvs: Command, short: Path, capture: Path) -> None:
     image = read_picture(capture / "images" / "001.png")
     (capture / "images" / "001.png").unlink()
@@ -125,6 +126,7 @@ def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: 
     assert set(summary["rejected"]) == {"002.png", "003.png"}
 
 
+@pytest.mark.slow
 def test_outputs_are_no_pictures_of_another_run(
     pano_mvs: Command, short: Path, capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -166,6 +166,7 @@ def test_events_name_the_blocks_and_the_end(pano_mvs: Command, runs: Runs, walk:
     assert "block 2 of 3, 12 images" in result.flat
 
 
+@pytest.mark.slow
 def test_the_same_command_resumes_and_replaces_the_links(pano_mvs: Command, runs: Runs, walk: Path) -> None:
     command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
     runs.ends["block_2"] = RunStoppedError("the disk is full")
@@ -334,6 +335,7 @@ def _not_started(_store: Store, _request: ExecutorRequest) -> Executor:
     raise AssertionError("the run itself is replaced")
 
 
+@pytest.mark.slow
 def test_events_of_all_blocks_are_printed(pano_mvs: Command, runs: Runs, walk: Path) -> None:
     result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--json")
     assert result.code == 0, result.text
@@ -344,6 +346,7 @@ def test_events_of_all_blocks_are_printed(pano_mvs: Command, runs: Runs, walk: P
     assert result.code == json.loads(result.text.splitlines()[-1])["exit_code"] == 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_memory")
 def test_a_run_from_python_is_divided_as_well(runs: Runs, walk: Path, tmp_path: Path) -> None:
     events: list[Event] = []
@@ -366,6 +369,7 @@ def test_a_run_from_python_is_divided_as_well(runs: Runs, walk: Path, tmp_path: 
         pano_mvs_package.run("quickstart", walk, block_size=5)
 
 
+@pytest.mark.slow
 def test_blocks_overlap_where_the_path_returns(pano_mvs: Command, runs: Runs, walk: Path) -> None:
     """The path goes to and fro, so the last images are beside the first."""
     centers = [(float(min(idx, 29 - idx)), 0.0, 0.3 * (idx > 14)) for idx in range(30)]

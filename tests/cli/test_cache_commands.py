@@ -207,6 +207,7 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
 
 
+@pytest.mark.slow
 def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: Cache) -> None:
     run(toy, "pinned", "--set", "scaled.by=5")
     run(toy, "out")

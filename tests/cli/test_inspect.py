@@ -275,6 +275,7 @@ def test_a_workflow_without_a_sweep_is_told(tmp_path: Path, run: Path) -> None:
     assert "no depth.sweep" in call("inspect", tmp_path / "none.yaml", "000.png", 1, 1).flat
 
 
+@pytest.mark.slow
 def test_a_dropped_result_is_computed_again_for_its_pixel(run: Path, tmp_path: Path) -> None:
     text = WORKFLOW.replace(
         "sources: depth}}",
@@ -306,6 +307,7 @@ def test_a_dropped_result_is_computed_again_for_its_pixel(run: Path, tmp_path: P
     assert is_dropped("000.png")
 
 
+@pytest.mark.slow
 def test_an_interrupted_inspection_is_not_remembered_as_a_run(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -53,6 +53,7 @@ KERNELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "module"), [*zip(("", "import numba\n"), KERNELS, strict=True)])
 def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, first: str, module: str) -> None:
     kernel, call = KERNELS[module]

@@ -80,6 +80,7 @@ def test_the_workflow_for_a_video_runs(pano_mvs: Command) -> None:
     assert run_json(Path("out"))["stages"][0]["run"] == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "last"), [("quickstart", "pairs"), ("walk", "masked")])
 def test_the_commands_for_a_folder_of_videos_run(preset: str, last: str, pano_mvs: Command) -> None:
     (line,) = [line for line in INPUT.splitlines() if line.startswith(f"pano-mvs run {preset}")]

@@ -71,6 +71,7 @@ def test_what_every_stage_takes_is_listed(stages: str) -> None:
     assert set(RESERVED_KEYS) == set(re.findall(r"^\| `(\w+)` \|", told, re.MULTILINE))
 
 
+@pytest.mark.slow
 def test_everything_in_the_api_is_described_once() -> None:
     page = hook("api_page").api_page()
     headings = re.findall(r"^### (\w+) \{ #(\w+) \}\n\n(.*)", page, re.MULTILINE)

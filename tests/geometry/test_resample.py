@@ -98,6 +98,7 @@ def test_a_nan_spoils_only_the_samples_that_need_it() -> None:
     assert np.isnan(samples).tolist() == [True, True, False, False, False, False]
 
 
+@pytest.mark.slow
 @given(ROTATIONS)
 @settings(max_examples=30, deadline=None)
 def test_turning_the_camera_turns_the_sphere(new_from_old: NDArray[np.float64]) -> None:

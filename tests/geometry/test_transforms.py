@@ -36,6 +36,7 @@ def test_a_rigid_transform_is_R_x_plus_t(pose: Rigid3, point: NDArray[np.float64
     assert pose.apply([[point, 2 * point]])[0, 1] == pytest.approx(pose.apply(2 * point), **CLOSE)
 
 
+@pytest.mark.slow
 @FEW
 @given(RIGIDS, RIGIDS, RIGIDS, POINTS)
 def test_rigid_transforms_are_a_group(first: Rigid3, second: Rigid3, third: Rigid3, point: NDArray[np.float64]) -> None:

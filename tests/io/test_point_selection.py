@@ -71,6 +71,7 @@ def test_it_keeps_what_a_dictionary_keeps(tmp_path: Path, voxel: float, threshol
     assert kept_idx(cloud, selection, tmp_path) == plainly_kept(cloud, selection)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("chunk", "bucket"), [(8, 16), (64, 100), (1 << 18, 3)])
 def test_how_the_work_is_cut_up_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int, bucket: int

@@ -160,6 +160,7 @@ def spots(rays: NDArray[np.float64], centers: NDArray[np.float64], sigma_rad: fl
     return np.repeat(np.rint(bright).astype(np.uint8)[..., None], 3, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("crop_ltwh", "file_hw", "size_hw"),
     [

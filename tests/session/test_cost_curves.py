@@ -50,6 +50,7 @@ def has_color(picture: NDArray[np.uint8], rgb: tuple[int, int, int]) -> bool:
     return bool((np.abs(picture.astype(int) - rgb).sum(axis=-1) < 20).any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_paths", [False, True])
 def test_marks_are_drawn_as_far_as_they_are_known(tmp_path: Path, *, by_paths: bool) -> None:
     picture = drawn(tmp_path / "new" / "a.png", inspection(by_paths=by_paths))
@@ -59,6 +60,7 @@ def test_marks_are_drawn_as_far_as_they_are_known(tmp_path: Path, *, by_paths: b
     assert not has_color(drawn(tmp_path / "b.png", inspection(true_range=np.nan)), truth)
 
 
+@pytest.mark.slow
 def test_any_name_can_be_drawn_and_nothing_is_lost_below(tmp_path: Path) -> None:
     """Names are not formulas, and characters that the font lacks raise no warning."""
     plain = drawn(tmp_path / "a.png", inspection(image="r\u00e4um/$x^2$_?.jpg", sources=11))

@@ -246,6 +246,7 @@ def test_a_failure_does_not_change_the_exit_code(toy: Toy, mine: Path, pano_mvs:
     assert json.loads(Path("a.json").read_text())[2:] == ["run_started"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["out", "json", "help", "workers", "class", "3d", "a.b", "kéy"])
 def test_no_name_of_an_observer_breaks_the_command(toy: Toy, mine: Path, pano_mvs: Command, name: str) -> None:
     """Two options with one name, or one that cannot be a parameter of Python, ended every `run`."""

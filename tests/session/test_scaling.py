@@ -114,6 +114,7 @@ def replace_values(run: pano_mvs.RunOutput) -> pano_mvs.RunOutput:
     return pano_mvs.RunOutput(run.out, run.summary, StoredValues())
 
 
+@pytest.mark.slow
 def test_a_second_measurement_corrects_the_first_and_the_workflow_can_be_run(run: pano_mvs.RunOutput) -> None:
     first = scaled(run, "000.png", "001.png", 5.0)
     second = scaled(first, "000.png", "001.png", 4.0)
@@ -221,6 +222,7 @@ def test_the_height_of_the_cameras_is_found_and_offered_but_not_applied() -> Non
     assert camera_height(poses, PointCloud(*(value[:10] for value in list(vars(cloud).values())[:4]))) is None
 
 
+@pytest.mark.slow
 def test_the_height_does_not_depend_on_the_size_of_the_cloud() -> None:
     """Of a large cloud, only some blocks are read."""
     cloud, poses = the_cloud(room_cloud(density=9000)), the_poses((2, 2, 1.28), metric=False)

@@ -84,6 +84,7 @@ def test_wrong_and_missing_ranges_are_bad() -> None:
     assert Bad(0.3, 0.2).ratio == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 def test_a_capture_on_disk_turns_like_the_scene(scene: Scene, tmp_path: Path) -> None:
     """Resampled from twice the size, a picture differs from one rendered in the turned camera by a few grey levels."""
     turn = {"000.png": rotation_from_rotvec((0.7, -1.1, 0.4))}

@@ -201,6 +201,7 @@ def test_pictures_that_differ_in_their_extension_alone_stay_apart(capture: Captu
     assert {"1.jpg_front.jpg", "1.png_front.jpg"} < {image.name for image in model.images.values()}
 
 
+@pytest.mark.slow
 def test_seeds_are_points_with_tracks_in_the_panoramas(capture: Capture, tmp_path: Path) -> None:
     ctx = context(tmp_path / "scratch")
     samples = {

@@ -25,6 +25,7 @@ def image(tmp_path: Path) -> Panorama:
     return Panorama(FilePart(tmp_path / "room.png"), SIZE_HW, SIZE_HW)
 
 
+@pytest.mark.slow
 def test_from_a_picture_to_its_room(image: Panorama, ctx: Context) -> None:
     lines = room_lines(image, RoomParams(), ctx)
     found = rooms(image, lines, ceilings({"room.png": lines}), ctx)

@@ -47,6 +47,7 @@ def at_full_size(
     )
 
 
+@pytest.mark.slow
 def test_ranges_have_the_size_of_the_file(unit: tuple[RangeMap, list[Panorama], list[Pose]], tmp_path: Path) -> None:
     found = at_full_size(unit, tmp_path)
     found.check()
@@ -94,6 +95,7 @@ def test_a_blurred_panorama_is_only_enlarged(unit: tuple[RangeMap, list[Panorama
     assert np.nanmax(np.abs(found.range / given.range.repeat(2, axis=0).repeat(2, axis=1) - 1)) < 0.03
 
 
+@pytest.mark.slow
 def test_what_a_mask_hides_changes_nothing(unit: tuple[RangeMap, list[Panorama], list[Pose]], tmp_path: Path) -> None:
     given, panoramas, poses = unit
     painted = []

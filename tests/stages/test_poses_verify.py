@@ -124,6 +124,7 @@ def test_without_matches_or_permission_it_only_reports(
     assert poses.translations.tobytes() == poses_of(tiny, wrong=True).translations.tobytes()
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_true_poses(tiny: TinyCapture, ctx: Context) -> None:
     poses = verified(tiny, ctx, wrong=False)
     assert poses.doubts == {}

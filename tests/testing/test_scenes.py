@@ -51,6 +51,7 @@ def test_a_rod_across_the_view_is_as_near_as_its_axis_less_its_radius() -> None:
     assert rod.hit(np.array([0, 0, 2.0]), rays)[0][0] == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_ranges_of_a_scene_are_exact_and_its_views_agree(name: str) -> None:
     scene = SCENES[name](seed=3)
@@ -118,6 +119,7 @@ def test_rods_are_a_few_pixels_thick() -> None:
     assert 1 < np.median(run) <= 5
 
 
+@pytest.mark.slow
 def test_exposure_changes_pictures_and_not_ranges() -> None:
     plain, exposed = courtyard(), courtyard(exposure=0.15)
     (image, ranges), (other, other_ranges) = plain.view(1, SIZE), exposed.view(1, SIZE)

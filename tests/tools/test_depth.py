@@ -131,6 +131,7 @@ def test_real_places_show_what_can_be_measured_without_truth() -> None:
     assert rows[-1] == (f"without {one.name}", "70.0", "95.0", "0.0123", "80.0", "1.0")
 
 
+@pytest.mark.slow
 def test_a_tripod_is_masked_and_has_no_true_range(tmp_path: Path) -> None:
     place = replace(ROOM, width=256, views=3, rig="tripod")
     capture = place.capture(tmp_path)
@@ -263,6 +264,7 @@ def test_the_model_of_laid_planes_is_that_of_the_stored_pixels() -> None:
         assert fitted.terms[name].losses == pytest.approx(term.losses, abs=0.05)
 
 
+@pytest.mark.slow
 def test_planes_are_laid_where_they_are_better_in_places_that_were_left_out() -> None:
     pixels = laid.read()
     kept = laid.left_out(pixels)
@@ -354,6 +356,7 @@ def drawn_as_it_is(storey: TrueStorey) -> dict[str, Any]:
     return {"rooms": rooms, "openings": openings}
 
 
+@pytest.mark.slow
 def test_sizes_and_leaves_that_are_wrong_are_counted() -> None:
     (storey,) = true_storeys("house_11")
     drawn = drawn_as_it_is(storey)
@@ -369,6 +372,7 @@ def test_sizes_and_leaves_that_are_wrong_are_counted() -> None:
     assert np.abs(found["levels"]).max() == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_moved_has_its_errors() -> None:
     (storey,) = true_storeys("house_11")
     moved = Samples(storey.walls.xy + np.array([0.03, 0.03]), storey.walls.along)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 from tools.mutation.groups import GROUPS
 from tools.mutation.mutants import mutants_of
 from tools.mutation.trial import SECONDS, Baseline
@@ -57,6 +59,7 @@ def test_ids_stay_where_code_moves() -> None:
     assert len(set(before)) == len(before)
 
 
+@pytest.mark.slow
 def test_every_fault_of_every_group_is_python_and_has_an_id_of_its_own() -> None:
     for title, group in GROUPS.items():
         assert all((ROOT / path).exists() for path in group.tests), title

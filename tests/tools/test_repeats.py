@@ -57,6 +57,7 @@ def test_a_corridor_looks_the_same_from_door_to_door() -> None:
     assert np.abs(one - half)[near].mean() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("congruence", ["shift", "half_turn"])
 def test_twin_rooms_are_congruent_but_for_unique_things(congruence: Literal["shift", "half_turn"]) -> None:
     def from_both(unique: float) -> tuple[NDArray[np.float64], float]:
@@ -75,6 +76,7 @@ def test_twin_rooms_are_congruent_but_for_unique_things(congruence: Literal["shi
     assert (difference > 10).any(axis=1).sum() + (1 - share) * SIZE[0] * SIZE[1] > 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REPEATS)
 def test_ranges_are_exact_and_a_seed_is_a_capture(name: str) -> None:
     scene, again, other = (REPEATS[name](seed=seed, views=4, exposure=0.1) for seed in (5, 5, 6))

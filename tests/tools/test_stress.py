@@ -22,6 +22,7 @@ def test_what_is_flipped_or_cut_short_is_noticed_and_healed(tmp_path: Path, chec
     assert check(patient, 50, random.Random(0)) == []
 
 
+@pytest.mark.slow
 def test_hostile_files_are_read_or_refused_by_name(tmp_path: Path) -> None:
     assert hostile.faults_in_process(25, 1, tmp_path) == []
 

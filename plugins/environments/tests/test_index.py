@@ -215,6 +215,7 @@ def test_inside_an_environment_there_are_no_others(noted: Environment, monkeypat
     assert list(provided()) == []
 
 
+@pytest.mark.slow
 def test_commands_read_the_index_and_nothing_else(noted: Environment) -> None:
     """A plan with built-in stages alone opens one file, and starts and imports nothing of an environment."""
     code = (

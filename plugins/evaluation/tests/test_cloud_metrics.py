@@ -90,6 +90,7 @@ class TestScores:
         assert scores[0].accuracy == scores[1].accuracy == 1
         assert scores[0].completeness > 0.99
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("off", [0.01, 0.03, 0.08])
     def test_a_cloud_that_lies_off_is_within_a_tolerance_that_allows_for_it(self, off: float) -> None:
         size = (256, 512)
@@ -121,6 +122,7 @@ class TestScores:
         nearest = np.array([np.linalg.norm(np.concatenate(pieces) - point, axis=1).min() for point in points])
         np.testing.assert_allclose(whole.of_points, nearest, rtol=1e-5)
 
+    @pytest.mark.slow
     def test_a_cloud_in_chunks_is_the_cloud(self, monkeypatch: pytest.MonkeyPatch) -> None:
         points = np.random.default_rng(3).normal(size=(900, 3)).astype(np.float32)
         surface, pieces = surface_of_views(VIEWS), [view_points(view) for view in VIEWS]

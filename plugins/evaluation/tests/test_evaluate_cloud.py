@@ -93,6 +93,7 @@ def test_truth_may_be_range_maps_in_files_beside_the_poses(
     assert found == wanted
 
 
+@pytest.mark.slow
 def test_only_what_the_cameras_used_see_must_be_found(
     pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
 ) -> None:

@@ -100,6 +100,7 @@ def test_the_table_tells_how_it_was_judged_and_what_constants_score(
     assert "the mean of the view's true ranges" in fitted.flat
 
 
+@pytest.mark.slow
 def test_pictures_json_and_csv_are_written(pano_mvs: Command, output: Path, truth: Path, tmp_path: Path) -> None:
     arguments = (
         "--truth",
@@ -133,6 +134,7 @@ def test_pictures_json_and_csv_are_written(pano_mvs: Command, output: Path, trut
     assert picture[60:560, 60:960].std() > 20
 
 
+@pytest.mark.slow
 def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: Path, tmp_path: Path) -> None:
     """Millimetres in 16-bit PNG against an archive of arrays at twice the size, no poses anywhere."""
     known = read_truth(truth)
@@ -183,6 +185,7 @@ def test_views_without_a_true_range_are_told_and_none_at_all_is_refused(pano_mvs
     assert (outcome.code, "no pixel of any view has a true range that counts" in outcome.flat) == (2, True)
 
 
+@pytest.mark.slow
 def test_masks_and_confidence_leave_out_what_they_say(
     pano_mvs: Command, output: Path, truth: Path, tmp_path: Path
 ) -> None:
@@ -259,6 +262,7 @@ class TestRun:
         assert "3 views of" in result.flat
         assert "cloud: not compared, there is no cloud.ply" in result.flat
 
+    @pytest.mark.slow
     def test_a_cloud_too(self, pano_mvs: Command, output: Path, truth: Path) -> None:
         known = read_truth(truth)
         views = [(view.cam_from_world, known.range_map(view)) for view in known.views.values()]

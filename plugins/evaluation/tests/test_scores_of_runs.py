@@ -34,6 +34,7 @@ def test_quickstart_recovers_poses_and_ranges(quickstart: tuple[Path, str]) -> N
         assert view["completeness"] > 0.95
 
 
+@pytest.mark.slow
 def test_evaluate_compares_an_output_folder_with_the_truth(
     quickstart: tuple[Path, str], rendered: Path, pano_mvs: Command
 ) -> None:

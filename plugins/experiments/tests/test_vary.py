@@ -60,6 +60,7 @@ GRID = ("--set", "scaled.by=2,3,5,7", "--set", "all.rng_seed=0,1,2")
 SMALL_GRID = ("--set", "scaled.by=2,3", "--set", "all.rng_seed=0,1")
 
 
+@pytest.mark.slow
 def test_a_grid_of_12_computes_each_distinct_unit_once(toy: Toy, pano_mvs: Command) -> None:
     """The toy capture has 28 units, so 12 runs have 336; 97 are distinct.
 
@@ -94,6 +95,7 @@ def test_runs_share_what_is_temporary_and_drop_it_when_all_have_ended(tmp_path: 
     assert computed(json.loads((tmp_path / "v" / "vary.json").read_text())) == [0, 0, 0], again.text
 
 
+@pytest.mark.slow
 def test_the_same_command_resumes(toy: Toy, pano_mvs: Command) -> None:
     assert vary(pano_mvs, toy, *SMALL_GRID).code == 0
     before = results(toy)
@@ -107,6 +109,7 @@ def test_the_same_command_resumes(toy: Toy, pano_mvs: Command) -> None:
     assert (toy.folder / "v" / "vary.csv").is_file()
 
 
+@pytest.mark.slow
 def test_more_values_reuse_the_runs_of_the_others(toy: Toy, pano_mvs: Command) -> None:
     assert vary(pano_mvs, toy, "--set", "scaled.by=2,3").code == 0
     assert vary(pano_mvs, toy, "--set", "scaled.by=2,3,4", "--seeds", "2").code == 0
@@ -115,6 +118,7 @@ def test_more_values_reuse_the_runs_of_the_others(toy: Toy, pano_mvs: Command) -
     assert by_run["by=2", 1] == by_run["by=3", 1] == 1
 
 
+@pytest.mark.slow
 def test_seeds_have_folders_of_their_own_and_seed_0_is_an_ordinary_run(toy: Toy, pano_mvs: Command) -> None:
     done = vary(pano_mvs, toy, "--set", "scaled.by=2,3", "--seeds", "3", "--metric", "scaled.value")
     assert done.code == 0, done.text
@@ -129,6 +133,7 @@ def test_seeds_have_folders_of_their_own_and_seed_0_is_an_ordinary_run(toy: Toy,
     assert Path("out/toy/all.txt").read_bytes() == (folder / "by=2" / "all.txt").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_list_and_draws_from_a_file(toy: Toy, pano_mvs: Command) -> None:
     file = toy.folder / "list.yaml"
     file.write_text("list:\n  - {}\n  - {scaled.by: 4, mean.retries: 2}\n")
@@ -229,6 +234,7 @@ def captures(toy: Toy) -> list[Path]:
     return folders
 
 
+@pytest.mark.slow
 def test_several_captures(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
     options = [word for folder in captures for word in ("--images", str(folder))]
     done = vary(pano_mvs, toy, *options, "--set", "scaled.by=2,3", "--metric", "scaled.value")
@@ -245,6 +251,7 @@ def test_several_captures(toy: Toy, captures: list[Path], pano_mvs: Command) -> 
     assert "given twice" in vary(pano_mvs, toy, *options, *options[:2], "--set", "scaled.by=2,3").flat
 
 
+@pytest.mark.slow
 def test_captures_for_which_another_combination_is_the_best_are_named(
     toy: Toy, captures: list[Path], pano_mvs: Command
 ) -> None:
@@ -284,6 +291,7 @@ def test_the_page_of_one_capture_shows_what_is_missing(toy: Toy, pano_mvs: Comma
 STOPPING = "use: toy.scale, on_error: stop"
 
 
+@pytest.mark.slow
 def test_a_combination_that_fails_does_not_end_the_others(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
     toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", STOPPING))
     (captures[1] / "3.txt").write_text("13")
@@ -303,6 +311,7 @@ def test_a_combination_that_fails_does_not_end_the_others(toy: Toy, captures: li
     assert vary(pano_mvs, toy, *options, "--set", "scaled.by=2,3", "--stop").code == 0
 
 
+@pytest.mark.slow
 def test_a_capture_that_cannot_be_read_is_in_the_table(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
     for path in captures[0].iterdir():
         path.unlink()
@@ -379,6 +388,7 @@ def test_every_mistake_is_reported_once(toy: Toy, captures: list[Path], pano_mvs
     assert done.flat.count("error:") == 3, done.text
 
 
+@pytest.mark.slow
 def test_a_folder_that_holds_something_else_is_refused(toy: Toy, pano_mvs: Command) -> None:
     out = toy.folder / "v"
     grid = ("--set", "scaled.by=2,3")
@@ -409,6 +419,7 @@ def test_a_folder_that_holds_something_else_is_refused(toy: Toy, pano_mvs: Comma
     assert (out / "vary.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_folder_over_more_captures_is_refused(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
     grid = ("--set", "scaled.by=2,3")
     both = [word for folder in captures for word in ("--images", folder)]
@@ -436,6 +447,7 @@ def test_a_stage_that_is_not_there_is_found_before_the_first_run(toy: Toy, pano_
     assert not (toy.folder / "v").exists()
 
 
+@pytest.mark.slow
 def test_the_folder_of_another_combination_is_refused(toy: Toy, captures: list[Path], pano_mvs: Command) -> None:
     grid = ("--set", "scaled.by=2,3")
     assert vary(pano_mvs, toy, *grid, "--set", "mean.retries=1").code == 0
@@ -471,6 +483,7 @@ def test_json_and_csv_hold_the_same(toy: Toy, pano_mvs: Command) -> None:
         assert (toy.folder / "v" / run["out"] / "run.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_dry_run_shows_what_would_be_computed_and_writes_nothing(toy: Toy, pano_mvs: Command) -> None:
     done = vary(pano_mvs, toy, *GRID, "--dry-run")
     assert done.code == 0
@@ -489,6 +502,7 @@ def test_a_dry_run_shows_what_would_be_computed_and_writes_nothing(toy: Toy, pan
     assert found["runs"][3]["settings"] == {"scaled.by": "3", "all.rng_seed": "1"}
 
 
+@pytest.mark.slow
 def test_vary_in_python_returns_records(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(toy.folder)
     ended: list[Event] = []
@@ -595,6 +609,7 @@ def test_the_python_on_the_page_prints_the_averages(
     assert printed[-1].startswith("best by confirmed (largest): planes=48,cost=zncc with 16")
 
 
+@pytest.mark.slow
 def test_the_files_on_the_page_can_be_used(page: str, pano_mvs: Command) -> None:
     found = re.findall(r"<!-- combinations -->\n```yaml\n(.*?)```", page, re.DOTALL)
     assert len(found) == 2

@@ -158,6 +158,7 @@ def test_each_wall_has_one_body_with_its_openings(angle_deg: float) -> None:
         assert (body is both) == (opening.kind == "door")
 
 
+@pytest.mark.slow
 def test_a_pillar_is_one_wall() -> None:
     corners = np.array([[1.5, 1.2], [1.5, 1.65], [1.95, 1.65], [1.95, 1.2]])
     panels = [(corners[idx - 1], corners[idx], 0.0, HEIGHT) for idx in range(4)]
@@ -170,6 +171,7 @@ def test_a_pillar_is_one_wall() -> None:
     assert sorted(body.thickness or 0 for body in known) == pytest.approx([0.2, 0.45], abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_beam_below_the_ceiling_is_not_a_wall() -> None:
     """Both sides of a beam of .3 m across the first room; the same down to the floor is a wall."""
     places = np.array([(0.6, 1.0), (0.8, 2.4), (3.3, 2.4), (3.2, 0.7), (5.5, 1.0)])

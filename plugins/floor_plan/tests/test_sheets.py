@@ -98,6 +98,7 @@ def test_the_sheet_is_at_its_scale_and_states_sizes(tmp_path: Path) -> None:
     assert door["leaf"] is None
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_for_each_room(tmp_path: Path) -> None:
     files, _ = planned(tmp_path, sheets=())
     with files.files["floor_plan/rooms.csv"].open(newline="", encoding="utf-8") as stream:
@@ -148,6 +149,7 @@ def test_a_scale_that_does_not_fit_is_replaced(
     assert ctx.notes == ([noted] if noted else [])
 
 
+@pytest.mark.slow
 def test_without_a_unit_no_scale_is_stated(tmp_path: Path) -> None:
     files, ctx = planned(tmp_path, flat_poses(metric=False), sheets=("svg",), scale=50)
     shown = texts(files)
@@ -245,6 +247,7 @@ def test_an_end_that_was_not_seen_is_open(tmp_path: Path) -> None:
     assert (row["is_closed"], row["length_m"], row["volume_m3"]) == ("false", "", "")
 
 
+@pytest.mark.slow
 def test_names_that_nothing_shows_are_said(tmp_path: Path) -> None:
     names = {"0.jpg": "Hall", "1.jpg": "Kitchen", "9.jpg": "Attic"}
     files, ctx = planned(

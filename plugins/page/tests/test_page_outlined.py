@@ -107,6 +107,7 @@ def test_an_opening_leaves_no_triangles_in_the_air() -> None:
     assert lengths.max() < 1.2, "the wall behind the opening is 1.5 units farther or more"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mesh", [False, True])
 def test_the_page_shows_rooms_that_links_place(tmp_path: Path, mesh: bool) -> None:
     run, cameras = with_house(box_run(tmp_path, points=2_000, mesh=mesh), tmp_path / "images")

@@ -171,6 +171,7 @@ def test_a_large_run_has_no_single_file(tmp_path: Path) -> None:
     assert shared.points == 2_000
 
 
+@pytest.mark.slow
 def test_a_run_is_shared_from_python_and_shown_in_a_notebook(tmp_path: Path) -> None:
     run = box_run(tmp_path)
     shared = run.share(str(tmp_path / "page"), pano_mvs.ShareOptions(title='The "lobby" & more', max_points=1000))
@@ -182,6 +183,7 @@ def test_a_run_is_shared_from_python_and_shown_in_a_notebook(tmp_path: Path) -> 
     assert f"Open {tmp_path / 'page' / 'index.html'} in a browser" in too_large._repr_html_()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("folder", "title"), [("office/images", "office"), ("2024 <flat>", "2024 <flat>")])
 def test_the_title_is_the_folder_of_the_capture(tmp_path: Path, folder: str, title: str) -> None:
     run = box_run(tmp_path, points=100)
@@ -230,6 +232,7 @@ def test_an_interrupted_page_is_written_again(tmp_path: Path) -> None:
     assert share_run(run, tmp_path / "page").panoramas == 3
 
 
+@pytest.mark.slow
 def test_a_panorama_that_is_gone_is_noted(tmp_path: Path) -> None:
     run = box_run(tmp_path, points=100)
     (tmp_path / "images" / NAMES[1]).unlink()

@@ -70,6 +70,7 @@ stages:
 """
 
 
+@pytest.mark.slow
 def test_a_tour_whose_rooms_matches_do_not_join_has_a_page(pano_mvs: Command, opened: list[str]) -> None:
     """One panorama a room: links say where the rooms are, and each picture outlines its own."""
     Path("tour").mkdir()

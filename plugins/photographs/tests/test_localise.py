@@ -111,6 +111,7 @@ def test_patches_refine_the_camera(model: Model, focal_px: float | None) -> None
     assert found.radial == pytest.approx(-0.05, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_photograph_that_was_cropped_on_one_side_is_refused(model: Model) -> None:
     """Its pose would be wrong by a degree for each 2 % of its width."""
     pose = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))

@@ -79,6 +79,7 @@ def test_a_single_photograph_is_localised(capture: Inputs, folder: Path, tmp_pat
     assert localise(*capture, LocaliseParams(path=folder / "2.png"), ctx).names == ("2.png",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [1, 32])
 def test_photographs_of_a_large_capture_are_localised_in_blocks(
     capture: Inputs, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int

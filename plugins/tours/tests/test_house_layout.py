@@ -47,6 +47,7 @@ def test_exact_links_put_single_panoramas_where_they_stand() -> None:
     assert turned.max() < 0.2
 
 
+@pytest.mark.slow
 def test_walls_correct_the_turns_that_links_give() -> None:
     tour = made_tour(seed=1, noise_deg=8.0)
     numbers = [2, 3, 4, 5]
@@ -98,6 +99,7 @@ def test_a_turn_that_several_solutions_give_is_not_said_to_be_sure(seed: int) ->
     assert places[1].turn_std_rad > np.deg2rad(60.0)
 
 
+@pytest.mark.slow
 def test_rounding_does_not_choose_between_equal_solutions() -> None:
     tour = made_tour(seed=6, noise_deg=8.0, one_way=(0, 2, 4))
     parts = [group(tour, (0, 1)), *(single(tour, number) for number in (2, 3, 4, 5))]

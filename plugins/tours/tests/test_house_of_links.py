@@ -63,6 +63,7 @@ def test_single_panoramas_and_another_group_stand_in_the_frame_of_the_largest_gr
     assert from_world.scale == pytest.approx(house.scales[3])
 
 
+@pytest.mark.slow
 def test_doubtful_cameras_stand_where_links_say() -> None:
     tour = made_tour()
     poses = poses_of(tour, (0, 1, 2, 3))
@@ -103,6 +104,7 @@ def test_without_links_doubtful_cameras_make_no_house() -> None:
     assert house.camera_height is None
 
 
+@pytest.mark.slow
 def test_copies_at_one_position_have_a_house() -> None:
     tour = made_tour()
     poses = poses_of(tour, (0, 0, 2))

@@ -327,6 +327,7 @@ def test_a_broken_configuration_is_named_and_the_paths_count(tmp_path: Path, fil
     assert f"{file}: not used as the configuration of a tour" in notes[0]
 
 
+@pytest.mark.slow
 def test_huge_numbers_cost_nothing(tmp_path: Path) -> None:
     write_tour(tmp_path, "Pannellum", KEYS[:2])
     numbers = {"maxLevel": 999_999_999, "cubeResolution": 1e300, "tileResolution": 1e-300, "path": "/%l/%s%y_%x"}

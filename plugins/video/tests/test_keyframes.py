@@ -98,11 +98,13 @@ def yaws(angles_deg: ArrayLike) -> NDArray[np.float64]:
     return np.stack([np.zeros_like(angles), angles, np.zeros_like(angles)], axis=1)
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_and_turns_gives_one_frame() -> None:
     assert numbers(chosen(np.zeros(40))).tolist() == [0]
     assert numbers(chosen(np.zeros(40), yaws(np.arange(40) * 9.0))).tolist() == [0]
 
 
+@pytest.mark.slow
 def test_a_walk_that_stops_gives_no_frames_while_it_stands() -> None:
     places = np.concatenate([np.linspace(-0.9, 0, 15), np.zeros(25), np.linspace(0, 0.9, 15)])
     found = numbers(chosen(places, yaws(np.concatenate([np.zeros(20), np.linspace(0, 180, 35)]))))
@@ -112,6 +114,7 @@ def test_a_walk_that_stops_gives_no_frames_while_it_stands() -> None:
     assert np.diff(places[found]).max() < 0.7
 
 
+@pytest.mark.slow
 def test_a_fast_walk_gives_more_frames_each_second_and_the_same_for_its_length() -> None:
     slow, fast = np.linspace(-0.9, 0.9, 60), np.linspace(-0.9, 0.9, 20)
     found = [places[numbers(chosen(places))] for places in (slow, fast)]

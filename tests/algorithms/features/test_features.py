@@ -98,6 +98,7 @@ def test_a_tile_shows_what_lies_in_its_directions() -> None:
         assert np.abs(sample_view(image, tile) - expected).max() < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "bias_px", "rms_px"), [("sift", 0.02, 0.06), ("orb", 0.1, 0.8), ("sphorb", 0.1, 1.0)])
 def test_key_points_have_no_bias(name: str, bias_px: float, rms_px: float) -> None:
     """A quarter of a pixel is what SIFT without the precise upscale, or ORB without its half pixel, would show."""
@@ -122,6 +123,7 @@ def test_key_points_have_no_bias(name: str, bias_px: float, rms_px: float) -> No
     assert np.abs(np.mean(np.einsum("nij,nj->ni", tile_from_cam[owner], offset), axis=0)[:2]).max() < bias_px
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_poles_and_seam_are_places_like_any_other(name: str) -> None:
     """The poles lie on the common edge of two tiles, which must not leave a key point to each other."""
@@ -135,6 +137,7 @@ def test_poles_and_seam_are_places_like_any_other(name: str) -> None:
     assert np.all(np.sum(found, axis=0) >= 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_record_is_sound_sorted_and_the_same_again(
     name: str, room_image: NDArray[np.uint8], of_room: Callable[..., Features]
@@ -170,6 +173,7 @@ def repeated_share(found: Features, other: Features, new_from_old: NDArray[np.fl
     return float(np.mean(cKDTree(other.bearings).query(strong)[0] < 1.0 * PIXEL))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_rolling_the_picture_rolls_the_key_points(
     name: str, room_image: NDArray[np.uint8], of_room: Callable[..., Features]
@@ -188,6 +192,7 @@ def test_turning_the_camera_turns_the_key_points(
     assert repeated_share(of_room("sift", max_keypoints=20_000), other, new_from_old) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_masked_pixels_and_their_border_have_no_key_points(name: str, room_image: NDArray[np.uint8]) -> None:
     rows = np.arange(SIZE[0])[:, None]

@@ -38,6 +38,7 @@ def test_ring_of_the_kernel_is_that_of_the_oracle() -> None:
     assert [[c, r] for r, c in oracle.STEPS] == NEIGHBOURS.tolist()
 
 
+@pytest.mark.slow
 def test_segment_test_equals_the_plain_one(pictures: NDArray[np.uint8]) -> None:
     threshold = 3
     scores = np.zeros_like(pictures)
@@ -69,6 +70,7 @@ def test_local_maxima_equal_the_plain_ones() -> None:
     assert cells.tolist() == expected
 
 
+@pytest.mark.slow
 def test_refinement_equals_climbing_the_plain_response(pictures: NDArray[np.uint8]) -> None:
     cells = np.array([[f, v, u] for f in range(2) for v, u in owned_cells(0)][::6], np.int64)
     window = np.concatenate([np.zeros((1, 2), np.int64), hexagon_ring(1), hexagon_ring(2)])

@@ -117,6 +117,7 @@ class TestFusion:
         assert np.median(np.abs(cloud.colors_rgb - expected)) <= 1
         assert (np.sum(cloud.normals_in_world * points, axis=1)[visible] < 0).mean() > 0.98
 
+    @pytest.mark.slow
     def test_each_surface_is_written_once_and_none_is_lost(self, views: list[FusionView]) -> None:
         cloud = fuse_views(views, ONCE)
         alone = [len(fuse_reference(view, [], [], settings=FusionSettings(min_views=1))) for view in views]
@@ -283,6 +284,7 @@ class TestOutliers:
 
 
 class TestStreaming:
+    @pytest.mark.slow
     @pytest.mark.parametrize("settings", [FusionSettings(neighbours=2), FusionSettings(neighbours=3, voxel_size=0.05)])
     def test_equals_all_at_once_and_holds_few(self, settings: FusionSettings) -> None:
         views = ball_views(7)

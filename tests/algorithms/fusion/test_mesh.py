@@ -115,6 +115,7 @@ def test_too_few_points_are_refused_with_the_remedy(tmp_path: Path, count: int) 
         mesh(room_cloud(count), None, MeshParams(), context(tmp_path))
 
 
+@pytest.mark.slow
 def test_points_without_a_surface_are_refused(tmp_path: Path) -> None:
     """All in one place: the solver gives a file without faces."""
     count = 200

@@ -57,6 +57,7 @@ def found(panorama: NDArray[np.uint8]) -> Features:
     return extracted(panorama, UP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_key_points_and_descriptors_are_those_of_pytorch(by_torch: Mapping[str, Any], number: int) -> None:
     image = (by_torch[f"picture{number}"].astype(np.float32) / 255).transpose(2, 0, 1)[None]
@@ -73,6 +74,7 @@ def test_key_points_and_descriptors_are_those_of_pytorch(by_torch: Mapping[str, 
     assert np.quantile(cosines, 0.05) > 0.98
 
 
+@pytest.mark.slow
 def test_matches_are_those_of_pytorch(by_torch: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch ran all layers without dropping key points; stopping early loses few matches.
 

@@ -172,6 +172,7 @@ def test_a_surface_is_removed_where_more_panoramas_look_through_it_than_measured
     assert area_near_board([shown[0], *unsure[1:3]]) > 0.7
 
 
+@pytest.mark.slow
 def test_the_pane_of_a_window_remains_although_another_panorama_looks_through_it() -> None:
     shown = board_seen_from((0, 0, -1.5), (0.2, 0, -1.5))
     through = replace(shown[1][0], range=np.full_like(shown[1][0].range, 4)), shown[1][1]

@@ -238,6 +238,7 @@ def test_poses_without_tracks_and_single_observations_stay(room: Room) -> None:
     assert np.array_equal(align_tracks(alone, pictures.__getitem__).track_bearings, alone.track_bearings)
 
 
+@pytest.mark.slow
 def test_refinement_with_the_images_is_twice_as_good(room: Room) -> None:
     poses, pictures = room
     bent = replace(

@@ -70,6 +70,7 @@ def by_name(poses: Poses) -> dict[str, Rigid3]:
     return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mapper", "cameras"), MAPPERS)
 def test_poses_are_recovered(capture: Capture, first_solved: First, mapper: Mapper, cameras: Cameras) -> None:
     poses = first_solved(mapper, cameras)
@@ -82,6 +83,7 @@ def test_poses_are_recovered(capture: Capture, first_solved: First, mapper: Mapp
     assert refined.median_pair_deg < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mapper", "cameras"), [("global", "sphere"), ("incremental", "faces")])
 def test_the_same_input_gives_the_same_digits(
     capture: Capture, first_solved: First, tmp_path: Path, mapper: Mapper, cameras: Cameras

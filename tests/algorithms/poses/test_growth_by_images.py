@@ -109,6 +109,7 @@ def test_small_range_maps_give_the_lengths_that_no_third_image_does() -> None:
         assert np.linalg.norm(model.cameras[image].center) == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_image_whose_places_nothing_confirms_is_left_out_with_the_reason() -> None:
     features, views = room_matches()
     shuffled = [*PICTURES[:4], PICTURES[4][:, ::-1].copy()]

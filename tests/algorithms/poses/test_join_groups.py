@@ -175,6 +175,7 @@ def test_rooms_are_joined_by_the_matches_of_all_their_pairs(turned: bool) -> Non
     assert off < 0.1
 
 
+@pytest.mark.slow
 def test_a_pair_that_only_lacks_a_direction_has_no_vote() -> None:
     """Such as of distant scenery: it is as significant as a verified one, but its direction is noise."""
     truth = room_poses(turned=True)
@@ -213,6 +214,7 @@ def test_rooms_that_fit_in_two_places_stay_two_groups() -> None:
     assert len(_solved(both).worlds) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pairs", "groups"), [([("a1", "b1")], 2), ([("a1", "b1"), ("a2", "b2")], 1)])
 def test_learned_pairs_that_are_weak_by_themselves_add_up(pairs: list[tuple[str, str]], groups: int) -> None:
     truth = room_poses()
@@ -376,6 +378,7 @@ def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: fl
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("floor", "groups"), [(100, 1), (0, 2)])
 def test_a_pair_that_sees_the_floor_joins_two_rooms(floor: int, groups: int) -> None:
     """It has no point with a known range."""

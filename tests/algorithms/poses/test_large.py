@@ -202,6 +202,7 @@ def test_contradictions_are_settled_as_by_the_plain_rule(seed: int) -> None:
     assert len(kept) < len(views)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_for_a_walk_again() -> None:
     rng = np.random.default_rng(10)
     capture = path_capture(rng, 8, keypoints=100)

@@ -36,6 +36,7 @@ def capture() -> AliasedCapture:
     return aliased_capture("solver", false=FALSE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjust", [False, True])
 def test_all_cameras_are_right_although_many_pairs_are_false(capture: AliasedCapture, adjust: bool) -> None:
     poses = solve(capture, adjust=adjust)
@@ -59,6 +60,7 @@ def test_the_same_bytes_again(capture: AliasedCapture) -> None:
     assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
 
 
+@pytest.mark.slow
 def test_the_order_of_the_capture_does_not_matter(capture: AliasedCapture) -> None:
     """Nor does which image of a pair comes first."""
     rng = np.random.default_rng(1)

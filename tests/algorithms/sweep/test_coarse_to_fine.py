@@ -199,6 +199,7 @@ def test_candidates_are_adopted_with_those_that_agree() -> None:
     assert np.isfinite(layer).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [PLAIN, PLAIN.replace(aggregation="box"), PLAIN.replace(cost="sad", aggregation="box")]
 )

@@ -117,6 +117,7 @@ def test_limits_hold_what_there_is_without_wasting_planes(
     assert farthest < far < 3 * farthest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", ["strong", "weak"])
 def test_the_near_limit_reaches_a_desk_within_the_baseline(top: Texture) -> None:
     scene = desk(seed=3, views=4, reach=1.6, top=top)
@@ -142,6 +143,7 @@ def table() -> Capture:
     return [image for image, _ in views], [scene.poses[idx] for idx in (3, 0, 1, 2)], [truth for _, truth in views]
 
 
+@pytest.mark.slow
 def test_the_near_limit_reaches_a_plain_table_nearer_than_all_textured_surfaces(
     table: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

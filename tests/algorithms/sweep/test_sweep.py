@@ -152,6 +152,7 @@ def test_the_number_of_threads_changes_no_byte() -> None:
         assert one.confidence.tobytes() == many.confidence.tobytes()
 
 
+@pytest.mark.slow
 def test_the_room_is_recovered_up_to_the_poles_and_the_seam() -> None:
     pictures, poses, truth = _capture(128, 4)
     result = _sweep(pictures, poses, SweepSettings(planes=64))
@@ -189,6 +190,7 @@ def test_nothing_is_sure_where_there_is_nothing_to_see() -> None:
     assert not _sweep((plain, plain), [pose]).valid.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
 def test_masked_pixels_have_no_range_and_no_vote(backend: str) -> None:
     pictures, poses, _ = _capture(32)

@@ -277,6 +277,7 @@ def write(known: Path, capture: Path, names: list[str], *, one_place: bool = Fal
     (known.parent / "poses.json").write_text(json.dumps(truth))
 
 
+@pytest.mark.slow
 def test_one_pose_is_not_given_to_several_pictures(pano_mvs: Command, known: Path, capture: Path) -> None:
     images = capture / "images"
     for folder, names in (("a", ("000.png", "001.png")), ("b", ("002.png", "003.png"))):

@@ -153,6 +153,7 @@ def test_a_second_run_computes_nothing_and_one_after_a_touch_what_depends_on_it(
     assert stages["poses"] == 1, "it looks whether the pictures are those whose poses the file records"
 
 
+@pytest.mark.slow
 def test_pictures_without_overlap_end_with_the_reasons(pano_mvs: Command, capture: Path) -> None:
     rng = np.random.default_rng(0)
     for path in sorted((capture / "images").iterdir()):

@@ -91,6 +91,7 @@ def test_values_that_are_moved_while_they_are_in_use_are_still_found(tmp_path: P
     assert not loose(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_damage_in_a_pack_is_noticed_and_computed_again(toy: Toy, seed: int) -> None:
     toy.run()

@@ -115,6 +115,7 @@ def test_any_file_gives_right_digests(tmp_path: Path, data: bytes, entry: list[o
         assert StatCache(tmp_path / "stat.json").digest(path) == digest_from_bytes(b"one")
 
 
+@pytest.mark.slow
 def test_well_made_lie_about_a_file_costs_time_only(toy: Toy) -> None:
     """A digest of other bytes under the right time stamps: what reads the file's bytes through the store notices."""
     toy.edit(

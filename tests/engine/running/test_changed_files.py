@@ -173,6 +173,7 @@ def test_image_that_is_put_back_finds_nothing_wrong_in_the_cache(texts: Toy) -> 
     assert delivered(texts) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["serial", "processes"])
 def test_image_that_vanishes_costs_that_image(texts: Toy, executor: str) -> None:
     """The run stopped with exit code 2."""

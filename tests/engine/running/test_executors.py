@@ -98,6 +98,7 @@ def test_processes_give_the_bytes_of_serial(toy: Toy, workers: int) -> None:
     assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")
 
 
+@pytest.mark.slow
 def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
     toy.number("2.txt", "13")
     toy.number("4.txt", "not a number")
@@ -109,6 +110,7 @@ def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
     assert "ValueError" in side_by_side.failures[0].trace
 
 
+@pytest.mark.slow
 def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
     seen = toy.folder / "seen"
@@ -140,6 +142,7 @@ if {when} and not pathlib.Path({str(mark)!r}).exists():
     toy.begin(code, of=of)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_killed_worker_costs_one_try(toy: Toy) -> None:
     kill_once(toy)
@@ -428,6 +431,7 @@ def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.
     assert not run_with(toy, SerialExecutor, "mean.memory=1MB", name="y").failures
 
 
+@pytest.mark.slow
 def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
     toy.begin("""
 import ctypes, logging, sys
@@ -506,6 +510,7 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
         make_executor(store, ExecutorRequest("processes", options={"scheduler": "tcp://somewhere:8786"}))
 
 
+@pytest.mark.slow
 def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     """An error in the middle ends the units in flight and the processes."""
     toy.begin("""

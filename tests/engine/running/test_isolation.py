@@ -94,6 +94,7 @@ def test_changes_by_a_plugins_part_of_a_built_in_stage_are_undone(
     assert bool(context.notes) == (not left)
 
 
+@pytest.mark.slow
 def test_a_forked_child_neither_stores_nor_answers(toy: Toy) -> None:
     """Units got the results of other units, since a forked child of the stage answered too, or failed."""
     clean = run_with(toy, SerialExecutor, name="clean")

@@ -198,6 +198,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @example({"a": {".Inf": None}})  # a text that YAML would read as a number which is refused
 @given(st.dictionaries(st.from_regex(r"[a-z]{1,12}", fullmatch=True), VALUES, min_size=1, max_size=4))
 def test_any_values_mean_the_same(settings: dict[str, object]) -> None:

@@ -185,6 +185,7 @@ def test_folders_that_are_fine(to: str) -> None:
     assert folder_problem(to) == ""
 
 
+@pytest.mark.slow
 @given(st.text(max_size=30))
 def test_what_passes_as_a_name_stays_inside(text: str) -> None:
     """Joined to a folder, names of stages, items and folders stay below it."""

@@ -90,6 +90,7 @@ def test_the_source_names_copies_and_uses_each_picture_once(tmp_path: Path, pict
     assert problems == {"1.png": "", "2.png": copied, "3.png": ""}
 
 
+@pytest.mark.slow
 def test_a_plan_does_not_read_pictures_for_copies(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
     paths = {name: tmp_path / name for name in ("a.png", "b.png")}
     for path in paths.values():

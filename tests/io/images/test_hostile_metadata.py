@@ -70,6 +70,7 @@ def hostile_exif(draw: st.DrawFn) -> bytes:
     return data + bytes(32)
 
 
+@pytest.mark.slow
 @given(hostile_exif())
 @settings(max_examples=100, deadline=None)
 def test_any_exif_is_read(data: bytes) -> None:
@@ -116,6 +117,7 @@ def test_any_position_is_read(order: str, latitude: Any, longitude: Any, altitud
 KINDS, FORMS = st.sampled_from(["jpg", "png", "webp", "avif"]), st.sampled_from(["element", "attribute"])
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.sampled_from(FIELDS), TEXTS), KINDS, FORMS)
 @example(full_sphere(10**9, 2 * 10**9), "jpg", "element")
 @example(full_sphere(32, 64, CroppedAreaLeftPixels=10**30), "png", "element")
@@ -197,6 +199,7 @@ CHANGES = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(CHANGES, st.sampled_from(["avif", "heic"]))
 @settings(max_examples=60, deadline=None)
 def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]], kind: str) -> None:

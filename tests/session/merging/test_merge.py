@@ -429,6 +429,7 @@ def test_an_export_that_fails_is_named_and_loses_nothing(tmp_path: Path) -> None
     assert (tmp_path / "merged/cloud.ply").is_file()
 
 
+@pytest.mark.slow
 def test_exports_are_computed_as_units_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They had one thread, and the same random numbers whatever their settings; sys.exit in one ended the merge."""
     registry = Registry.installed()
@@ -476,6 +477,7 @@ def test_stages_of_a_block_cannot_lead_outside(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("outside*"))
 
 
+@pytest.mark.slow
 def test_exports_need_no_numbers_of_views_in_the_files_of_blocks(tmp_path: Path) -> None:
     """By default, export.ply writes none."""
     outs = with_exports(

@@ -27,6 +27,7 @@ def moved(offset: tuple[float, float, float], turn_deg: float = 0.0) -> Rigid3:
     return Rigid3.from_center(turn @ POSES[IMAGE].rotation, POSES[IMAGE].center + np.array(offset))
 
 
+@pytest.mark.slow
 def test_an_image_shows_what_is_expected_where_it_was_taken(surroundings: Surroundings) -> None:
     there = surroundings.appearance(IMAGE, POSES[IMAGE])
     assert there.agreement > 0.6

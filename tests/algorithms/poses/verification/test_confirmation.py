@@ -32,6 +32,7 @@ def confirmation() -> Confirmation:
     return confirmation_of()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("image", [0, 3])
 def test_a_true_pose_is_confirmed_and_a_moved_one_is_not(confirmation: Confirmation, image: int) -> None:
     true = confirmation.share(image, POSES[image], CAMERAS)
@@ -45,6 +46,7 @@ def test_a_turned_pose_is_not_confirmed(confirmation: Confirmation) -> None:
     assert confirmation.share(1, turned, CAMERAS) < 0.4 * confirmation.share(1, POSES[1], CAMERAS)
 
 
+@pytest.mark.slow
 def test_the_pose_of_the_image_among_the_cameras_does_not_count(confirmation: Confirmation) -> None:
     elsewhere = {**CAMERAS, 2: moved(POSES[2], (0.5, 0.0, 0.0))}
     assert confirmation_of().share(2, POSES[2], elsewhere) == confirmation.share(2, POSES[2], CAMERAS)
@@ -64,6 +66,7 @@ def test_a_similarity_of_the_world_changes_nothing(confirmation: Confirmation) -
     assert confirmation_of().share(3, world[3], world) == pytest.approx(expected, abs=0.01)
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_neither_asked_nor_believed(confirmation: Confirmation) -> None:
     """What is under the mask may be anything."""
     whole = confirmation.evidence(0, POSES[0], CAMERAS)
@@ -78,6 +81,7 @@ def test_masked_pixels_are_neither_asked_nor_believed(confirmation: Confirmation
     assert halves[0].share == pytest.approx(halves[1].share, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["all masked", "plain"])
 def test_an_image_without_texture_says_nothing(what: str) -> None:
     picture = (PICTURES[0], ~WHOLE) if what == "all masked" else (np.full_like(PICTURES[0], 130), WHOLE)
@@ -140,6 +144,7 @@ def test_maps_of_nearly_the_same_poses_are_near_enough() -> None:
     assert again == pytest.approx(fresh, abs=0.03)
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_does_not_matter_and_stays() -> None:
     import numba
 

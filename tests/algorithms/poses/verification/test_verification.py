@@ -237,6 +237,7 @@ def test_groups_are_judged_apart() -> None:
     np.testing.assert_allclose(known(small.confirmed_shares), known(alone.confirmed_shares), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
     scene = white_room(seed=3, views=4)
     pictures = {f"{idx}.png": scene.view(idx, SIZE_HW)[0] for idx in range(4)}
