@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +112,13 @@ class StoredRun:
     def record(self, stage: str, item: str) -> UnitRecord | None:
         """Return what a unit was made of and what it made; None if the cache does not have it."""
         key = self.keys.get(stage, {}).get(item)
-        return None if key is None or self.store is None else self.store.read_record(key)
+        return None if key is None or self.store is None else self._read_record(key)
+
+    @cached_property
+    def _read_record(self) -> Callable[[str], UnitRecord | None]:
+        """Reads the record of a key; the way back from one file asks for some of them a hundred times."""
+        assert self.store is not None
+        return lru_cache(maxsize=4096)(self.store.read_record)
 
     def records(self, stage: str) -> Iterator[tuple[str, UnitRecord]]:
         """Yield the units of a stage that the cache has, with their items."""
