@@ -15,9 +15,14 @@ from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles
 from pano_mvs.algorithms.learned.networks import TILE_PX, Networks
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec
 from pano_mvs.scene import Features
-from tests.algorithms.learned.test_networks import SIZE, UP, by_torch, colmap, found, panorama
+from tests.algorithms.learned.test_networks import SIZE, UP, by_torch, colmap, panorama
 
-__all__ = ["by_torch", "colmap", "found", "panorama"]  # fixtures
+__all__ = ["by_torch", "colmap", "panorama"]  # fixtures
+
+
+@pytest.fixture(scope="module")
+def found(panorama: NDArray[np.uint8]) -> Features:
+    return extract_aliked(panorama, np.ones(SIZE, np.bool_), ups=[UP], max_keypoints=1500)
 
 
 @pytest.mark.slow
