@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.lengths import lengths_of, open_lengths, pairs_of_scales
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, Triangulated, build_tracks, triangulate_observations
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
@@ -276,16 +277,20 @@ class PlacedModel:
         tracks, members = self.tracks()
         found = self._triangulated(tracks, members)
         if cameras:
+            bundle = Bundle(
+                rotations=np.array([self.cameras[image].rotation for image in members]),
+                centers=np.array([self.cameras[image].center for image in members]),
+                points=found.points_in_world[found.valid],
+                point_idx=(np.cumsum(found.valid) - 1)[tracks.track_idx[found.used]].astype(np.int32),
+                image_idx=tracks.image_idx[found.used],
+                bearings=tracks.bearings[found.used],
+            )
+            loss, scales = RobustLoss("cauchy", MAX_ERROR_RAD / 4), pairs_of_scales(bundle)
+            # Otherwise, a room that one pair joins with the rest moves along the direction of the pair.
+            known = open_lengths(bundle, scales, lengths_of(scales, bundle.centers), scale_rad=loss.scale_rad)
             bundle = adjust_bundle(
-                Bundle(
-                    rotations=np.array([self.cameras[image].rotation for image in members]),
-                    centers=np.array([self.cameras[image].center for image in members]),
-                    points=found.points_in_world[found.valid],
-                    point_idx=(np.cumsum(found.valid) - 1)[tracks.track_idx[found.used]].astype(np.int32),
-                    image_idx=tracks.image_idx[found.used],
-                    bearings=tracks.bearings[found.used],
-                ),
-                RobustLoss("cauchy", MAX_ERROR_RAD / 4),
+                replace(bundle, lengths=known),
+                loss,
                 max_iterations=20,
                 tolerance=1e-3,  # the finished model is refined anyway
                 fixed_camera=members.index(next(iter(self.cameras))),
