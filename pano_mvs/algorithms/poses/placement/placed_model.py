@@ -287,9 +287,9 @@ class PlacedModel:
             )
             loss, scales = RobustLoss("cauchy", MAX_ERROR_RAD / 4), pairs_of_scales(bundle)
             # Otherwise, a room that one pair joins with the rest moves along the direction of the pair.
-            known = open_lengths(bundle, scales, lengths_of(scales, bundle.centers), scale_rad=loss.scale_rad)
+            lengths = open_lengths(bundle, scales, lengths_of(scales, bundle.centers), scale_rad=loss.scale_rad)
             bundle = adjust_bundle(
-                replace(bundle, lengths=known),
+                replace(bundle, lengths=lengths),
                 loss,
                 max_iterations=20,
                 tolerance=1e-3,  # the finished model is refined anyway
