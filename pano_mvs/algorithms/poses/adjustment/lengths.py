@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths
 from pano_mvs.core.arrays import FloatArray
@@ -87,7 +86,7 @@ def pairs_of_scales(bundle: Bundle) -> NDArray[np.intp]:
     direction, and drifts.
     """
     count = len(bundle.centers)
-    seen = coo_array(
+    seen = scipy.sparse.coo_array(
         (np.ones(len(bundle.point_idx), np.int32), (bundle.point_idx, bundle.image_idx)), (len(bundle.points), count)
     ).tocsr()
     seen.data[:] = 1
@@ -101,7 +100,8 @@ def pairs_of_scales(bundle: Bundle) -> NDArray[np.intp]:
         columns += [number[one, thirds], number[other, thirds]]
         rows.append(np.full(2 * len(thirds), edge))
     at = np.concatenate(rows), np.concatenate(columns)
-    _, part = connected_components(coo_array((np.ones(len(at[0])), at), (len(first), len(first))), directed=False)
+    joined = scipy.sparse.coo_array((np.ones(len(at[0])), at), (len(first), len(first)))
+    _, part = scipy.sparse.csgraph.connected_components(joined, directed=False)
     best = np.lexsort((-shared[first, second], part))
     chosen = best[np.flatnonzero(np.diff(part[best], prepend=-1))]
     return np.column_stack([first, second])[chosen]
