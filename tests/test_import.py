@@ -30,6 +30,17 @@ def test_nobody_waits_for_the_libraries_of_solvers(module: str) -> None:
     assert done.stdout.split() == []
 
 
+def test_all_stages_are_known_without_the_libraries_that_they_compute_with() -> None:
+    """One module that imported parts of scipy made every command wait half a second longer."""
+    slow = {"numba", "onnxruntime", "pycolmap", "pyvista", "trimesh"}
+    code = (
+        "import sys; from pano_mvs.engine.stages.registry import Registry; Registry.installed(); "
+        f"print(*(name for name in sys.modules if name in {slow} or name.startswith(('scipy.s', 'scipy.o'))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_all_names_are_there_and_type_checkers_see_the_same() -> None:
     tree = ast.parse(Path(pano_mvs.__file__).read_text(encoding="utf-8"))
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]

@@ -32,11 +32,11 @@ class UsageError(PanoMvsError, ValueError):
 
 
 class WorkflowError(UsageError):
-    """One or more errors in a workflow; `problems` holds one line for each."""
+    """One or more errors in a workflow; `problems` holds a text for each, and a cause that several have but once."""
 
     def __init__(self, problems: list[str]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(problems))
+        self.problems = _each_cause_once(problems)
+        super().__init__("\n".join(self.problems))
 
 
 class InputError(PanoMvsError, ValueError):
@@ -77,3 +77,14 @@ class RunStoppedError(PanoMvsError, RuntimeError):
     """The run stops here, such as at a quality threshold; what was computed stays in the cache."""
 
     exit_code = 4
+
+
+def _each_cause_once(problems: list[str]) -> list[str]:
+    """Return problems without what follows their first line, such as a traceback, if it was there before."""
+    told: set[str] = set()
+    shorter = []
+    for problem in problems:
+        first, _, cause = problem.partition("\n")
+        shorter.append(first if cause in told else problem)
+        told.add(cause)
+    return shorter

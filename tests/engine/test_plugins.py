@@ -89,6 +89,18 @@ def test_the_traceback_of_a_broken_plugin_is_the_original_one(mine: Path) -> Non
     assert "bad.py" not in text
 
 
+def test_a_workflow_without_several_stages_of_a_broken_plugin_says_once_why(mine: Path) -> None:
+    (mine / "bad.py").write_text(BROKEN)
+    workflow = mine.parent / "workflow.yaml"
+    workflow.write_text(
+        "stages:\n  one: {use: filters.unlucky}\n  two: {use: filters.lost}\n  three: {use: filters.x}\n"
+    )
+    code, text = command("check", str(workflow))
+    assert code == 2
+    assert text.count("there is no stage") == 3
+    assert text.count("ZeroDivisionError: division by zero") == 1
+
+
 def test_a_part_of_a_broken_plugin_says_why_it_is_not_there(mine: Path) -> None:
     (mine / "bad.py").write_text(
         "from pano_mvs.api import register_toy_part\n\n@register_toy_part('mine')\ndef f(): ...\n"
