@@ -9,7 +9,7 @@ import numpy as np
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
+from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec
 from pano_mvs.scene import TwoView
 
 MAX_ERROR_RAD = float(np.deg2rad(0.5))
@@ -60,16 +60,17 @@ def refine_resection(
         scale_rad: error at which the weight is one half.
         iterations: maximum number of steps.
     """
+    frames = np.concatenate([np.swapaxes(tangent_basis(bearings), 1, 2), bearings[:, None]], axis=1)
     pose, damping = cam_from_world, 1e-6
-    cost = _cost(pose, points_in_world, bearings, scale_rad=scale_rad)
+    cost = _cost(pose, points_in_world, frames, scale_rad=scale_rad)
     for _ in range(iterations):
-        residuals, jacobian = _linearised(pose, points_in_world, bearings)
+        residuals, jacobian = _linearised(pose, points_in_world, frames[:, :2])
         weights = 1 / (1 + np.sum(residuals**2, axis=1) / scale_rad**2)
-        hessian = np.einsum("mij,m,mik->jk", jacobian, weights, jacobian)
-        gradient = np.einsum("mij,m,mi->j", jacobian, weights, residuals)
+        weighted = (jacobian * weights[:, None, None]).reshape(-1, 6).T
+        hessian, gradient = weighted @ jacobian.reshape(-1, 6), weighted @ residuals.ravel()
         step = -np.linalg.solve(hessian + np.diag(damping * hessian.diagonal() + 1e-15), gradient)
         moved = Rigid3.from_center(rotation_from_rotvec(step[:3]) @ pose.rotation, pose.center + step[3:])
-        moved_cost = _cost(moved, points_in_world, bearings, scale_rad=scale_rad)
+        moved_cost = _cost(moved, points_in_world, frames, scale_rad=scale_rad)
         if moved_cost >= cost:
             damping *= 100
             continue
@@ -80,23 +81,28 @@ def refine_resection(
     return pose
 
 
-def _linearised(pose: Rigid3, points: FloatArray, bearings: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _linearised(pose: Rigid3, points: FloatArray, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the residuals on the bearings' tangent planes, (M, 2), and their derivatives by ω and centre, (M, 2, 6).
 
-    r = Bᵀ x / |x|, x = R (X − C); with R ← exp(ω) R, ∂x/∂ω = −[x]× and ∂x/∂C = −R.
+    r = Bᵀ x / |x|, x = R (X − C); with R ← exp(ω) R, ∂x/∂ω = −[x]× and ∂x/∂C = −R. With u = x / |x| and b a row of Bᵀ,
+    (b − (b·u) u)ᵀ [x]× / |x| = (b × u)ᵀ.
     """
     in_cam = pose.apply(points)
     length = np.linalg.norm(in_cam, axis=1)
     unit = in_cam / length[:, None]
-    basis = np.swapaxes(tangent_basis(bearings), 1, 2)
-    by_point = (basis - (basis @ unit[:, :, None]) * unit[:, None, :]) / length[:, None, None]
-    jacobian = np.concatenate([-by_point @ skew(in_cam), -by_point @ pose.rotation], axis=2)
-    return (basis @ unit[:, :, None])[..., 0], jacobian
+    residuals = np.einsum("mij,mj->mi", tangents, unit)
+    jacobian = np.empty((*residuals.shape, 6))
+    for axis, (one, other) in enumerate(((1, 2), (2, 0), (0, 1))):
+        jacobian[:, :, axis] = unit[:, None, one] * tangents[:, :, other] - unit[:, None, other] * tangents[:, :, one]
+    across = tangents - residuals[:, :, None] * unit[:, None]
+    across /= -length[:, None, None]
+    jacobian[:, :, 3:] = (across.reshape(-1, 3) @ pose.rotation).reshape(across.shape)
+    return residuals, jacobian
 
 
-def _cost(pose: Rigid3, points: FloatArray, bearings: FloatArray, *, scale_rad: float) -> float:
-    errors = resection_errors(pose, points, bearings)
-    return float(np.sum(np.log1p((errors / scale_rad) ** 2)))
+def _cost(pose: Rigid3, points: FloatArray, frames: FloatArray, *, scale_rad: float) -> float:
+    x, y, along = np.einsum("mij,mj->im", frames, pose.apply(points))
+    return float(np.sum(np.log1p((np.arctan2(np.hypot(x, y), along) / scale_rad) ** 2)))
 
 
 def best_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> tuple[str, str] | None:

@@ -64,7 +64,7 @@ class Surroundings:
             return Appearance()
         expected, known = _seen(pose, points, colors, shape=small.mask.shape)
         known &= small.mask
-        shown = self._colors(image)
+        shown = self._confirmation.colors_lab(image)
         area = np.broadcast_to(pixel_solid_angle(known.shape)[:, None], known.shape)
         textured = small.textured & small.mask
         agreement, inside = _window_correlations(expected, shown, known)
@@ -92,12 +92,7 @@ class Surroundings:
         known = np.isfinite(ranges)
         camera = self._cameras[image]
         points = camera.center + ranges[known, None] * (ray_grid(ranges.shape)[known] @ camera.rotation)
-        return points, self._colors(image)[known]
-
-    def _colors(self, image: int) -> NDArray[np.float32]:
-        """Return the colours of a small picture in Lab, (H, W, 3), slightly blurred."""
-        lab = cv2.cvtColor(self._confirmation.small(image).image, cv2.COLOR_RGB2LAB).astype(np.float32)
-        return np.asarray(cv2.GaussianBlur(lab, (3, 3), 0.8), np.float32)
+        return points, self._confirmation.colors_lab(image)[known]
 
 
 def _seen(
@@ -107,15 +102,16 @@ def _seen(
     height, width = shape
     in_camera = pose.apply(points)
     distances = np.linalg.norm(in_camera, axis=1)
-    order = np.argsort(-distances, kind="stable")  # the nearest of a pixel is written last
-    order = order[distances[order] > 0]
-    columns, rows = np.floor(pixel_from_ray(in_camera[order] / distances[order, None], (height, width))).astype(int).T
+    ahead = np.flatnonzero(distances > 0)
+    columns, rows = np.floor(pixel_from_ray(in_camera[ahead], (height, width))).astype(int).T
     places = rows.clip(0, height - 1) * width + columns % width
-    last = np.full(height * width, -1)
-    np.maximum.at(last, places, np.arange(len(places)))
-    known = last >= 0
+    # Positive floats are ordered as their bits are, so that the least key of a pixel is that of its nearest point.
+    keys = distances[ahead].astype(np.float32).view(np.uint32).astype(np.uint64) << 32 | ahead.astype(np.uint64)
+    nearest = np.full(height * width, np.iinfo(np.uint64).max)
+    np.minimum.at(nearest, places, keys)
+    known = nearest < np.iinfo(np.uint64).max
     seen = np.zeros((height * width, 3), np.float32)
-    seen[known] = colors[order[last[known]]]
+    seen[known] = colors[(nearest[known] & 0xFFFFFFFF).astype(np.intp)]
     return seen.reshape(height, width, 3), known.reshape(height, width)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +37,7 @@ _WIDE = slice(5, _CLASSES - 1)  # the classes of more than 30°
 _MIN_WIDE_SR = 0.1
 # Weight, as solid angle, of the overall share in each class.
 _PRIOR = 0.05
+_MAX_COLORS = 256  # pictures whose colours in Lab are kept, of .4 MB each
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,7 @@ class Confirmation:
         self._load = load
         self._width_px = width_px
         self._small: dict[int, _Small] = {}
+        self._colors_lab: dict[int, NDArray[np.float32]] = {}
         self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], RangeMap]]] = OrderedDict()
         self._evidence_of: dict[tuple[tuple[int, ...], ...], list[tuple[list[Rigid3], Evidence]]] = {}
 
@@ -218,6 +221,15 @@ class Confirmation:
             reduced = reduced_panorama(picture, self._width_px)
             self._small[image] = _Small(reduced, reduced_mask(mask, self._width_px), textured_pixels(reduced))
         return self._small[image]
+
+    def colors_lab(self, image: int) -> NDArray[np.float32]:
+        """Return the colours of a small picture in Lab, (H, W, 3), slightly blurred."""
+        if image not in self._colors_lab:
+            if len(self._colors_lab) >= _MAX_COLORS:
+                del self._colors_lab[next(iter(self._colors_lab))]
+            lab = cv2.cvtColor(self.small(image).image, cv2.COLOR_RGB2LAB).astype(np.float32)
+            self._colors_lab[image] = np.asarray(cv2.GaussianBlur(lab, (3, 3), 0.8), np.float32)
+        return self._colors_lab[image]
 
     def _swept(self, image: int, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
