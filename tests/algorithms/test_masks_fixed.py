@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.masks.areas import areas_of_color, reduced_to_width
 from pano_mvs.algorithms.masks.static_content import (
     MIN_VIEWS,
+    FrameAgreement,
     color_difference,
     evenly_spread_pairs,
-    frame_agreement,
     static_content,
 )
 from pano_mvs.core.errors import UsageError
@@ -172,9 +172,9 @@ def test_margin_and_area(views: list[NDArray[np.uint8]]) -> None:
 def test_sharpness_is_positive_only_where_structure_agrees_exactly(views: list[NDArray[np.uint8]]) -> None:
     shifted = [np.roll(views[0], columns, axis=1) for columns in (0, 1, 2)]
     middle = slice(64, 192)
-    textured = frame_agreement([views[0]] * 3).contrast[middle] > 8
-    assert (frame_agreement([views[0]] * 3).sharpness[middle][textured] > 0).mean() > 0.9
-    assert (frame_agreement(shifted).sharpness[middle][textured] > 0).mean() < 0.05
+    textured = FrameAgreement([views[0]] * 3).contrast[middle] > 8
+    assert (FrameAgreement([views[0]] * 3).sharpness[middle][textured] > 0).mean() > 0.9
+    assert (FrameAgreement(shifted).sharpness[middle][textured] > 0).mean() < 0.05
 
 
 def test_pairs_are_spread_over_all_views() -> None:

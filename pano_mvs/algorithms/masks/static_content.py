@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import Annotated, Any, TypeAlias
 
@@ -37,38 +38,69 @@ _DISAGREEING = 0.2
 _TILT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-@dataclass(frozen=True, eq=False)
 class FrameAgreement:
-    """Statistics over pairs of panoramas, each (H, W) float32.
+    """How well panoramas of one camera agree at the same pixels of their own frames: statistics over pairs of them.
 
-    Windows are compared by zero-mean normalised cross-correlation (ZNCC), which does not depend on exposure.
+    Windows are compared by zero-mean normalised cross-correlation (ZNCC), which does not depend on exposure. Each of
+    the planes, (H, W) float32, is computed when it is asked for.
 
-    `contrast`: median standard deviation of the windows, in grey levels. `agreement`: ZNCC of windows at the same
-    pixel, exceeded by four fifths of the pairs. `sharpness`: by how much that ZNCC exceeds the best one a pixel away,
-    exceeded by four fifths of the pairs. Positive only where structure in all directions agrees to a fraction of a
-    pixel: edges alone agree along themselves, and distant content is displaced a little. `still`: the best ZNCC within
-    three pixels, exceeded by a quarter of the pairs. It is small where the world moves between nearly all views.
+    Args:
+        pictures: panoramas of one size, (H, W, 3) uint8 RGB.
     """
 
-    contrast: Plane
-    agreement: Plane
-    sharpness: Plane
-    still: Plane
+    def __init__(self, pictures: Sequence[Picture]) -> None:
+        self._pairs = evenly_spread_pairs(len(pictures))
+        # Beyond this elevation, windows are compared in a chart whose poles lie on the horizon of the first.
+        self._polar = np.abs(ray_grid((pictures[0].shape[0], pictures[0].shape[1]))[..., 1]) > np.sin(np.pi / 4)
+        tilted = [rotate_panorama(picture, _TILT) for picture in pictures]
+        self._charts = [[_windows(picture) for picture in chart] for chart in (pictures, tilted)]
+        self._same = [[_zncc(chart[i], chart[j]) for i, j in self._pairs] for chart in self._charts]
 
+    @cached_property
+    def contrast(self) -> Plane:
+        """Median standard deviation of the windows, in grey levels."""
+        variances = ([variance for _, _, variance in chart] for chart in self._charts)
+        upright, tilted = (np.sqrt(np.maximum(_quantile(each, 0.5), 0)).astype(np.float32) for each in variances)
+        return self._joined(upright, tilted)
 
-def frame_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
-    """Return how well panoramas of one size, (H, W, 3) uint8 RGB, agree at the same pixels of their own frames."""
-    upright = _chart_agreement(pictures)
-    tilted = _chart_agreement([rotate_panorama(picture, _TILT) for picture in pictures])
-    size_hw = (pictures[0].shape[0], pictures[0].shape[1])
-    # Beyond this elevation, windows are compared in a chart whose poles lie on the horizon of the first.
-    polar = np.abs(ray_grid(size_hw)[..., 1]) > np.sin(np.pi / 4)
-    return FrameAgreement(
-        *(
-            np.where(polar, rotate_panorama(getattr(tilted, field.name), _TILT.T), getattr(upright, field.name))
-            for field in fields(FrameAgreement)
+    @cached_property
+    def agreement(self) -> Plane:
+        """ZNCC of windows at the same pixel, exceeded by four fifths of the pairs."""
+        return self._joined(*(_quantile(same, _DISAGREEING) for same in self._same))
+
+    @cached_property
+    def sharpness(self) -> Plane:
+        """By how much that ZNCC exceeds the best one a pixel away, exceeded by four fifths of the pairs.
+
+        It is positive only where structure in all directions agrees to a fraction of a pixel: edges alone agree along
+        themselves, and distant content is displaced a little.
+        """
+        around = ([_best_around(chart[i], chart[j], step=1) for i, j in self._pairs] for chart in self._charts)
+        return self._joined(
+            *(
+                _quantile([here - best for here, best in zip(same, each, strict=True)], _DISAGREEING)
+                for same, each in zip(self._same, around, strict=True)
+            )
         )
-    )
+
+    @cached_property
+    def still(self) -> Plane:
+        """The best ZNCC within three pixels, exceeded by a quarter of the pairs.
+
+        It is small where the world moves between nearly all views.
+        """
+        around = ([_best_around(chart[i], chart[j], step=3) for i, j in self._pairs] for chart in self._charts)
+        return self._joined(
+            *(
+                _quantile([np.maximum(here, best) for here, best in zip(same, each, strict=True)], 0.75)
+                for same, each in zip(self._same, around, strict=True)
+            )
+        )
+
+    def _joined(self, upright: Plane, tilted: Plane) -> Plane:
+        """Return the plane of the first chart with the poles of the second, without their margins."""
+        upright, tilted = (plane[_PAD:-_PAD, _PAD:-_PAD] for plane in (upright, tilted))
+        return np.where(self._polar, rotate_panorama(tilted, _TILT.T), upright)
 
 
 def evenly_spread_pairs(count: int) -> list[tuple[int, int]]:
@@ -87,24 +119,6 @@ def color_difference(pictures: Sequence[Picture], gains: NDArray[np.float64]) ->
     smooth = [mean_around(picture) * gain.astype(np.float32) for picture, gain in zip(pictures, gains, strict=True)]
     apart = [largest_channel(np.abs(smooth[i] - smooth[j])) for i, j in evenly_spread_pairs(len(pictures))]
     return _quantile(apart, 1 - _DISAGREEING)
-
-
-def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
-    compared = [_windows(picture) for picture in pictures]
-    same, sharper, still = [], [], []
-    for first, second in evenly_spread_pairs(len(pictures)):
-        here = _zncc(compared[first], compared[second])
-        same.append(here)
-        sharper.append(here - _best_around(compared[first], compared[second], step=1))
-        still.append(np.maximum(here, _best_around(compared[first], compared[second], step=3)))
-    inner = (slice(_PAD, -_PAD), slice(_PAD, -_PAD))
-    variance = _quantile([variance for _, _, variance in compared], 0.5)
-    return FrameAgreement(
-        contrast=np.sqrt(np.maximum(variance, 0)).astype(np.float32)[inner],
-        agreement=_quantile(same, _DISAGREEING)[inner],
-        sharpness=_quantile(sharper, _DISAGREEING)[inner],
-        still=_quantile(still, 0.75)[inner],
-    )
 
 
 def _quantile(planes: Sequence[NDArray[Any]], share: float) -> Plane:
@@ -195,17 +209,18 @@ def static_content(
         return StaticContent(nothing, f"{MIN_VIEWS} panoramas of a camera are needed, it has {len(pictures)}")
     if size_hw[1] < _MIN_WIDTH:
         return StaticContent(nothing, f"panoramas of at least {_MIN_WIDTH} columns are needed")
-    agreement = frame_agreement(pictures)
+    agreement = FrameAgreement(pictures)
     usable = np.ones(size_hw, np.bool_)
     if valid is not None and not all(mask.all() for mask in valid):  # windows that are not masked anywhere
         usable = ~dilated(~np.logical_and.reduce(list(valid)), 4)
     # A window has structure from this standard deviation on, in grey levels.
     structure = (agreement.contrast >= 4.0) & usable
-    moved = structure & (agreement.still < 0.75)
+    areas = _seeded_areas(agreement, structure)
+    moved = structure & ((agreement.still if areas else agreement.agreement) < 0.75)  # at least as small as the former
     # The share of the sphere that has to move between the views, or they may all be of one place.
     if share_of_sphere(moved) < 0.03:
         return StaticContent(nothing, "the panoramas do not differ enough: are they all of one place?")
-    core = _grown(agreement, structure, moved)
+    core = _in_moving_surroundings(areas, structure, moved)
     if not core.any():
         return StaticContent(nothing)
     found = large_areas(_with_enclosed_parts(core, pictures, plain=usable & ~structure), min_area_deg2)
@@ -213,16 +228,27 @@ def static_content(
     return StaticContent(dilated(found, margin) if margin and found.any() else found)
 
 
-def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:
-    """Return connected areas of agreeing structure that contain seeds and lie in surroundings that move."""
-    agrees = structure & (agreement.agreement >= 0.5) & (agreement.sharpness >= -0.02)
-    seeds = structure & (agreement.agreement >= 0.7) & (agreement.sharpness >= 0.03)
-    labels = area_labels(agrees | seeds)
-    weights = pixel_weights(seeds.shape)
+def _seeded_areas(agreement: FrameAgreement, structure: Mask) -> list[Mask]:
+    """Return connected areas of agreeing structure that contain seeds."""
+    agrees, seeds = structure & (agreement.agreement >= 0.5), structure & (agreement.agreement >= 0.7)
+    if not _areas_with(seeds, agrees):
+        return []  # in most captures, and what follows takes most of the time
+    seeds &= agreement.sharpness >= 0.03
+    return _areas_with(seeds, (agrees & (agreement.sharpness >= -0.02)) | seeds)
+
+
+def _areas_with(seeds: Mask, pixels: Mask) -> list[Mask]:
+    """Return the connected areas of some pixels that contain enough seeds."""
+    labels, weights = area_labels(pixels), pixel_weights(seeds.shape)
     enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= 12
-    found = np.zeros_like(seeds)
-    for label in np.flatnonzero(enough):
-        area = labels == label
+    return [labels == label for label in np.flatnonzero(enough)]
+
+
+def _in_moving_surroundings(areas: Sequence[Mask], structure: Mask, moved: Mask) -> Mask:
+    """Return the areas, as one mask, around which most of the structure moves between the views."""
+    weights = pixel_weights(structure.shape)
+    found = np.zeros_like(structure)
+    for area in areas:
         # Around content that moves with the camera, at least this share of the structure moves.
         ring = dilated(area, 6) & ~dilated(area, 1)
         structured = float(weights[ring & structure].sum())
