@@ -32,7 +32,14 @@ Units
 from pano_mvs.core import kernel_cache
 from pano_mvs.geometry.lens_rig import FisheyeLens, LensRig
 from pano_mvs.geometry.pinhole import PinholeView
-from pano_mvs.geometry.resample import pad_panorama, roll_panorama, rotate_panorama, sample_panorama
+from pano_mvs.geometry.resample import (
+    pad_panorama,
+    positions_in_padded,
+    roll_panorama,
+    rotate_panorama,
+    sample_panorama,
+    view_in_padded,
+)
 from pano_mvs.geometry.sphere import (
     UP,
     angle_between,
@@ -73,6 +80,7 @@ __all__ = [
     "pad_panorama",
     "pixel_from_ray",
     "pixel_solid_angle",
+    "positions_in_padded",
     "quat_wxyz_from_rotation",
     "ranges_from_bearings",
     "ray_from_pixel",
@@ -89,4 +97,5 @@ __all__ = [
     "skew",
     "spiral_rays",
     "triangulate_bearings",
+    "view_in_padded",
 ]

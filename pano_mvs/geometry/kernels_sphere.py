@@ -1,8 +1,8 @@
 """Compiled: the equirectangular camera for single pixels and rays, for use in other kernels.
 
-The conventions are those of `pano_mvs.geometry`, the arithmetic that of `sphere` and `resample`. The functions take and
-return plain numbers and are inlined where they are called. The `fast_` functions are for float32 in vectorised loops,
-the `even_` functions for float64 in vectorised loops.
+The conventions are those of `pano_mvs.geometry`, the arithmetic that of `sphere` and `resample`. All functions but
+`fill_positions` take and return plain numbers and are inlined where they are called. The `fast_` functions are for
+float32 in vectorised loops, the `even_` functions for float64 in vectorised loops.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pano_mvs.core.kernels import inlined
+from pano_mvs.core.kernels import inlined, kernel
 
 _F = np.float32
 _HALF_PI, _TINY = _F(np.pi / 2), _F(1e-30)
+_BLOCK = 256
 
 
 @inlined
@@ -152,3 +154,50 @@ def even_atan2(y: float, x: float) -> float:
     angle = math.pi / 2 - angle if ay > ax else angle
     angle = math.pi - angle if x < 0 else angle
     return -angle if y < 0 else angle
+
+
+@inlined
+def _write_positions(
+    block: NDArray[np.float64], size: tuple[int, int], shift: float, positions: NDArray[np.float32]
+) -> None:
+    """Write the positions (N, 2) of rays, whose components are the rows of `block`, which changes."""
+    for n in range(len(positions)):
+        x, y, z = block[0, n], block[1, n], block[2, n]
+        block[0, n] = (even_atan2(x, z) / (2 * math.pi) + 0.5) * size[1] + shift
+        block[1, n] = (0.5 - even_atan2(-y, math.sqrt(x * x + z * z)) / math.pi) * size[0] + shift
+    for n in range(len(positions)):
+        positions[n, 0] = block[0, n]
+        positions[n, 1] = block[1, n]
+
+
+@kernel
+def fill_positions(
+    rays: NDArray[np.float64], size: tuple[int, int], shift: float, positions: NDArray[np.float32]
+) -> None:
+    """Write the position in pixels of each ray (N, 3), (N, 2), plus `shift`, as `pixel_from_ray` of `sphere` does."""
+    block = np.empty((3, _BLOCK))  # loops over arrays of one component are vectorised
+    for start in range(0, len(rays), _BLOCK):
+        count = min(_BLOCK, len(rays) - start)
+        for n in range(count):
+            for axis in range(3):
+                block[axis, n] = rays[start + n, axis]
+        _write_positions(block, size, shift, positions[start : start + count])
+
+
+@kernel
+def fill_view_positions(
+    plane: tuple[NDArray[np.float64], NDArray[np.float64]],
+    view_from_cam: NDArray[np.float64],
+    size: tuple[int, int],
+    shift: float,
+    positions: NDArray[np.float32],
+) -> None:
+    """Write the positions (h, w, 2) of the rays (x, y, 1) of a pinhole view, x and y the vectors of `plane`."""
+    columns, rows = plane
+    block = np.empty((3, len(columns)))
+    for row in range(len(rows)):
+        for axis in range(3):
+            ahead = rows[row] * view_from_cam[1, axis] + view_from_cam[2, axis]
+            for n in range(len(columns)):
+                block[axis, n] = columns[n] * view_from_cam[0, axis] + ahead
+        _write_positions(block, size, shift, positions[row])

@@ -9,13 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import (
+    PinholeView,
     angle_between,
     kernels_sphere,
     pad_panorama,
     pixel_from_ray,
+    positions_in_padded,
     ray_from_pixel,
     ray_grid,
+    rotation_from_rotvec,
     sample_panorama,
+    view_in_padded,
 )
 
 pytestmark = pytest.mark.kernel("geometry.kernels_sphere")
@@ -119,3 +123,22 @@ def test_the_arc_tangent_without_branches_is_as_exact_as_the_library() -> None:
         for x in [*values, *(-value for value in values)]:
             expected = 0.0 if x == y == 0 else math.atan2(y + 0.0, x + 0.0)
             assert kernels_sphere.even_atan2(y, x) == pytest.approx(expected, rel=1e-15, abs=1e-15)
+
+
+@pytest.mark.parametrize("size_hw", [(4, 8), (512, 1024)])
+def test_positions_are_the_pixels_of_rays_as_opencv_counts(size_hw: tuple[int, int]) -> None:
+    rays = np.concatenate([drawn_rays(), np.random.default_rng(3).normal(size=(600, 3))])
+    found = positions_in_padded(rays.reshape(-1, 1, 3), size_hw, 4)[:, 0]
+    off = np.abs(found - (pixel_from_ray(rays, size_hw) + 3.5))
+    off[:, 0] = np.minimum(off[:, 0], size_hw[1] - off[:, 0])  # the seam is at either end
+    assert off.max() < 1e-7 * size_hw[1]
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(3, 9)])
+@pytest.mark.parametrize("offset_xy", [(0.5, 0.5), (0.25, 0.75)])
+def test_positions_of_a_view_are_those_of_its_rays(rows: slice, offset_xy: tuple[float, float]) -> None:
+    rotation = rotation_from_rotvec(np.array([1.2, 0.4, -0.3]))
+    view = PinholeView(rotation.T, 5.0, np.array([5.5, 4.0]), (10, 12))
+    found = view_in_padded(view, (64, 128), 2, rows=rows, offset_xy=offset_xy)
+    expected = positions_in_padded(view.rays(rows, offset_xy=offset_xy), (64, 128), 2)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)

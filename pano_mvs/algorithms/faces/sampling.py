@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid
+from pano_mvs.geometry import PinholeView, pad_panorama, positions_in_padded, ray_from_pixel, ray_grid, view_in_padded
 from pano_mvs.scene.poses import Poses
 from pano_mvs.scene.upright import world_up
 
@@ -29,16 +29,15 @@ def sample_view(
     linear or cubic interpolation. `samples`: number of evenly spread samples in each pixel along each side, which are
     averaged.
     """
-    padded = pad_panorama(panorama, min(_PAD_PX, *panorama.shape[:2]))
-    # OpenCV puts (0, 0) at the first pixel's centre.
-    shift = min(_PAD_PX, *panorama.shape[:2]) - 0.5
+    pad_px = min(_PAD_PX, *panorama.shape[:2])
+    padded = pad_panorama(panorama, pad_px)
     result = np.empty((*view.size_hw, *panorama.shape[2:]), np.uint8)
     size_hw, places = (panorama.shape[0], panorama.shape[1]), [(step + 0.5) / samples for step in range(samples)]
     for rows in _bands(view.size_hw[0]):
         total = np.zeros(result[rows].shape, np.float32)
         for offset_xy in ((x, y) for y in places for x in places):
-            pixels = (pixel_from_ray(view.rays(rows, offset_xy=offset_xy), size_hw) + shift).astype(np.float32)
-            total += cv2.remap(padded, pixels[..., 0], pixels[..., 1], interpolation)
+            at = view_in_padded(view, size_hw, pad_px, rows=rows, offset_xy=offset_xy)
+            total += cv2.remap(padded, at, None, interpolation)
         result[rows] = np.rint(total / samples**2)
     return result
 
@@ -151,6 +150,6 @@ def turned_panorama(
     for first in range(0, height, _BAND_ROWS):
         y = np.arange(first, min(first + _BAND_ROWS, height)) + 0.5
         rays = ray_from_pixel(np.stack(np.meshgrid(x, y), axis=-1), (height, width)) @ new_from_old
-        at = (pixel_from_ray(rays, (height, width)) + (_CUBIC_PAD_PX - 0.5)).astype(np.float32)
-        turned[first : first + len(y)] = cv2.remap(padded, at[..., 0], at[..., 1], interpolation)
+        at = positions_in_padded(rays, (height, width), _CUBIC_PAD_PX)
+        turned[first : first + len(y)] = cv2.remap(padded, at, None, interpolation)
     return turned

@@ -23,7 +23,7 @@ from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.geometry import pad_panorama, positions_in_padded
 from pano_mvs.scene import Features
 
 _PAD_PX = 4
@@ -127,9 +127,7 @@ def _sampling_maps(grid: GeodesicGrid, size_hw: tuple[int, int]) -> tuple[NDArra
     weights = grid._weights(np.stack([u, v], axis=-1))
     maps = []
     for corners in face_corners():
-        # OpenCV puts (0, 0) at the first pixel's centre.
-        pixels = pixel_from_ray(weights @ corners, size_hw) + (_PAD_PX - 0.5)
-        maps.append(pixels.astype(np.float32))
+        maps.append(positions_in_padded(weights @ corners, size_hw, _PAD_PX))
     stacked = np.concatenate(maps)
     first_map, second_map = cv2.convertMaps(stacked, None, cv2.CV_16SC2)
     first_map.setflags(write=False)

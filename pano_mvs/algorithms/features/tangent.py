@@ -17,7 +17,7 @@ from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoi
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
+from pano_mvs.geometry import PinholeView, pad_panorama, view_in_padded
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
@@ -273,9 +273,7 @@ def owned_pixels(size_hw: tuple[int, int], tile_idx: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=_TILES)
 def _kept_map(size_hw: tuple[int, int], tile_idx: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    # OpenCV puts (0, 0) at the first pixel's centre.
-    shift = min(_PAD_PX, *size_hw) - 0.5
-    pixels = (pixel_from_ray(tangent_tiles(size_hw)[tile_idx].rays(), size_hw) + shift).astype(np.float32)
+    pixels = view_in_padded(tangent_tiles(size_hw)[tile_idx], size_hw, min(_PAD_PX, *size_hw))
     x, y = np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
     x.setflags(write=False)
     y.setflags(write=False)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.learned.networks import packaged_network
 from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec
+from pano_mvs.geometry import PinholeView, pad_panorama, positions_in_padded, ray_grid, rotation_from_rotvec
 
 SIDE_PX = 256
 """Width and height of the pictures that the networks read."""
@@ -108,7 +108,7 @@ class Look:
     def from_sphere(self) -> Map:
         """The position (x, y) of each pixel in a panorama, (256, 256, 2), as shares of its width and height."""
         size_hw = (SIDE_PX, 2 * SIDE_PX)
-        return np.asarray(pixel_from_ray(self.rays, size_hw) / size_hw[::-1], np.float32)
+        return (positions_in_padded(self.rays, size_hw, 0) + np.float32(0.5)) / np.array(size_hw[::-1], np.float32)
 
     @cached_property
     def pixels(self) -> Map:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, positions_in_padded, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -150,8 +150,8 @@ def differences(picture: NDArray[np.float32], rays_in_cam: FloatArray, *, axis: 
     `picture`: from `blurred`. A strong edge counts no more than one of 40 levels, and stays as sharp as it is.
     """
     size = picture.shape[0] - 2 * _PAD_PX, picture.shape[1] - 2 * _PAD_PX
-    pixels = (pixel_from_ray(rays_in_cam, size) + (_PAD_PX - 0.5)).astype(np.float32)
-    colors = np.moveaxis(cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR), axis, 0)
+    at = positions_in_padded(rays_in_cam, size, _PAD_PX)
+    colors = np.moveaxis(cv2.remap(picture, at, None, cv2.INTER_LINEAR), axis, 0)
     changes = colors[2 * HALF_DIFFERENCE :] - colors[: -2 * HALF_DIFFERENCE]
     largest = np.abs(changes).max(axis=-1)
     around = cv2.dilate(largest.reshape(len(largest), -1), np.ones((4 * HALF_DIFFERENCE + 1, 1), np.uint8))
