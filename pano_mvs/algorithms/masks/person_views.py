@@ -108,7 +108,8 @@ class Look:
     def from_sphere(self) -> Map:
         """The position (x, y) of each pixel in a panorama, (256, 256, 2), as shares of its width and height."""
         size_hw = (SIDE_PX, 2 * SIDE_PX)
-        return (positions_in_padded(self.rays, size_hw, 0) + np.float32(0.5)) / np.array(size_hw[::-1], np.float32)
+        positions = positions_in_padded(self.rays, size_hw, 0) + np.float32(0.5)
+        return np.asarray(positions / np.array(size_hw[::-1]), np.float32)
 
     @cached_property
     def pixels(self) -> Map:
