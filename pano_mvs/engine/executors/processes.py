@@ -18,11 +18,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
+from pano_mvs.engine.executors.fork_server import ForkedProcess, ForkServer
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment
 from pano_mvs.engine.executors.unit_requests import request_to_json
@@ -31,6 +32,7 @@ from pano_mvs.engine.executors.worker import MARK, end_started
 UNITS_PER_PROCESS = 500
 """A worker is replaced after this many units, so that memory leaks of libraries do not add up."""
 
+Process: TypeAlias = subprocess.Popen[bytes] | ForkedProcess
 _LISTEN_S = 0.5  # some systems notice interrupts only between waits
 
 
@@ -52,6 +54,7 @@ class ProcessExecutor(Executor):
         self._workers: list[tuple[threading.Thread, WorkerProcess]] = []
         self._failed_starts = 0
         self._closing = False
+        self._forks = ForkServer(self.cores)
 
     def submit(self, job: Job) -> None:
         """Submit a job; another worker is started if all are busy."""
@@ -62,7 +65,7 @@ class ProcessExecutor(Executor):
                 make_folder(errors.parent)
             except OSError as error:
                 raise self._store.cannot_write(error) from error
-            worker = WorkerProcess(self.cores, errors, units=self._units_per_process)
+            worker = WorkerProcess(self.cores, errors, units=self._units_per_process, forks=self._forks)
             thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
             self._workers.append((thread, worker))
             thread.start()
@@ -101,6 +104,7 @@ class ProcessExecutor(Executor):
         self._closing = True
         if self._out:
             self.cancel()
+            self._forks.close()  # or a worker that is being started would be waited for
         for _ in self._workers:
             self._jobs.put(None)
         for thread, worker in self._workers:
@@ -109,6 +113,7 @@ class ProcessExecutor(Executor):
                 worker.kill()
                 thread.join(_LISTEN_S)
         self._workers.clear()
+        self._forks.close()
 
     def _serve(self, worker: WorkerProcess) -> None:
         """Pass units to one worker until there are no more."""
@@ -150,6 +155,7 @@ class WorkerProcess:
         errors: Path,
         *,
         units: int = UNITS_PER_PROCESS,
+        forks: ForkServer | None = None,
         python: Sequence[str] = (),
         variables: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
@@ -159,11 +165,13 @@ class WorkerProcess:
             threads: the most threads that a unit may use.
             errors: file for what the process prints outside units, such as why it cannot start.
             units: the most units of one process; the next unit gets another one.
+            forks: forks the process, if it can.
             python: another interpreter with its options, in which pano_mvs is installed; by default this one, with
                 the same path.
             variables: what is different in the environment of the process.
         """
         self._units = units
+        self._forks = forks
         self._python = tuple(python)
         self._variables = variables
         self.threads = threads
@@ -172,7 +180,7 @@ class WorkerProcess:
         self.refused = False  # whether the latest process exited by itself before it was ready for a unit
         self._ready = False
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Process | None = None
         self._too_late = False
         self._left_s = math.inf
         self._mark = uuid.uuid4().hex
@@ -214,16 +222,23 @@ class WorkerProcess:
         if process is not None:
             _kill(process, self._mark)
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> Process:
         self._mark = uuid.uuid4().hex
+        self.served, self.refused, self._ready, self._too_late = 0, False, False, False
+        forked = self._forks.fork(self._mark, self.errors) if self._forks is not None else None
+        self._process = forked or self._popen()
+        self._lines = queue.SimpleQueue()
+        threading.Thread(target=_read_lines, args=(self._process, self._lines), daemon=True).start()
+        return self._process
+
+    def _popen(self) -> subprocess.Popen[bytes]:
         environment = {**os.environ, **self._variables, MARK: self._mark}
         bound_environment(environment, self.threads)
         path = json.dumps([place for place in sys.path if place])  # "" would mean the current folder
         same = [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path]
         command = [*self._python, "-X", "faulthandler", "-c", _BOOT_THERE] if self._python else same
-        self.served, self.refused, self._ready, self._too_late = 0, False, False, False
         with self.errors.open("wb") as errors:
-            self._process = subprocess.Popen(  # noqa: S603 (our own code)
+            return subprocess.Popen(  # noqa: S603 (our own code)
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -233,13 +248,8 @@ class WorkerProcess:
                 start_new_session=os.name == "posix",
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
-        self._lines = queue.SimpleQueue()
-        threading.Thread(target=_read_lines, args=(self._process, self._lines), daemon=True).start()
-        return self._process
 
-    def _listen(
-        self, process: subprocess.Popen[bytes], whose: Mapping[str, str], timeout_s: float
-    ) -> JobOutcome | None:
+    def _listen(self, process: Process, whose: Mapping[str, str], timeout_s: float) -> JobOutcome | None:
         """Return the outcome from the worker, or None if it dies first, even if others hold its output open."""
         while (line := self._next_line(process)) is not None:
             try:
@@ -255,7 +265,7 @@ class WorkerProcess:
             self._left_s = timeout_s
         return None
 
-    def _next_line(self, process: subprocess.Popen[bytes]) -> bytes | None:
+    def _next_line(self, process: Process) -> bytes | None:
         """Return the next line from the worker, which is ended when its time is over; None if it has ended.
 
         The time is that in which this process waits: a clock would go on while both processes are stopped.
@@ -272,20 +282,20 @@ class WorkerProcess:
                 self._too_late, self._left_s = True, math.inf
                 self.kill()
 
-    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> JobOutcome:
+    def _death(self, process: Process, timeout_s: float) -> JobOutcome:
         self._process = None
-        _close(process, self._mark)
+        status = _close(process, self._mark)
         if self._too_late:
             return JobOutcome(
                 "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
             )
-        self.refused = not self._ready and process.returncode >= 0
+        self.refused = not self._ready and status >= 0
         said = () if self._ready else tail(self.errors, 3)
-        cause = f"its worker process died ({_how(process.returncode)})" + "".join(f"\n  {line}" for line in said)
+        cause = f"its worker process died ({_how(status)})" + "".join(f"\n  {line}" for line in said)
         return JobOutcome("failed", cause=cause, died=True)
 
 
-def _read_lines(process: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
+def _read_lines(process: Process, lines: queue.SimpleQueue[bytes | None]) -> None:
     """Pass on the lines that a process writes, and None at the end, until nobody holds its output open."""
     assert process.stdout is not None
     try:
@@ -296,18 +306,18 @@ def _read_lines(process: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes
         lines.put(None)
 
 
-def _close(process: subprocess.Popen[bytes], mark: str) -> None:
-    """Close the input of a process, which ends it, and wait for that; end it and what it started in any case."""
+def _close(process: Process, mark: str) -> int:
+    """Close the input of a process, which ends it, and return its exit status; end it and what it started anyway."""
     with suppress(OSError):  # unsent data is not needed any more
         if process.stdin is not None:
             process.stdin.close()
     with suppress(subprocess.TimeoutExpired):
         process.wait(5.0)
     _kill(process, mark)
-    process.wait()
+    return process.wait()
 
 
-def _kill(process: subprocess.Popen[bytes], mark: str) -> None:
+def _kill(process: Process, mark: str) -> None:
     """End a process and all that it started, which may outlive it."""
     if os.name != "posix":
         process.kill()

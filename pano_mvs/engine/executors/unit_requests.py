@@ -276,7 +276,10 @@ def _store(root: str, durable: bool, min_free_bytes: int) -> Store:
 
 
 @cache
-def _installed() -> Registry:
+def load_installed() -> Registry:
+    """Load all installed stages, once in a process."""
+    # Before the first unit, because numba reads its maximum number of threads when it is loaded.
+    importlib.import_module("numba")
     return Registry.installed()
 
 
@@ -298,9 +301,7 @@ def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
     """Return a stage by name, from the plugin files or the installed ones, after loading what it may use."""
     spec = _of_files(tuple(plugins.items())).stages.get(name)
     if spec is None:
-        # Before the first unit, because numba reads its maximum number of threads when it is loaded.
-        importlib.import_module("numba")
-        spec = _installed().stages.get(name)
+        spec = load_installed().stages.get(name)
     if spec is None:
-        raise PluginError(f"the worker knows no stage {name!r}; {_installed().suggest(name)}")
+        raise PluginError(f"the worker knows no stage {name!r}; {load_installed().suggest(name)}")
     return spec

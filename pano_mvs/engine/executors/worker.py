@@ -34,9 +34,7 @@ def main() -> None:
     """Serve requests until the input ends."""
     requests_in, answers_out = _take_streams()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles interrupts
-    if sys.platform == "linux":
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+    adopt_orphans()
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(requests_in, requests, os.environ.get(MARK, "")), daemon=True).start()
     from pano_mvs.engine.executors.unit_requests import run_request  # after the streams, because imports may print
@@ -47,6 +45,13 @@ def main() -> None:
         whose = {"nonce": request["nonce"], "key": request["unit"]["key"]}
         _answer(answers_out, {**whose, "started": True})
         _answer(answers_out, {**whose, "outcome": run_request(request).to_json()})
+
+
+def adopt_orphans() -> None:
+    """Let this process, on Linux, be the parent of those below it whose own parents end."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
 
 
 def _take_streams() -> tuple[BinaryIO, BinaryIO]:
@@ -101,15 +106,27 @@ def end_started(worker: int, mark: str) -> None:
         os.killpg(worker, signal.SIGKILL)
 
 
+def children_of(parent: int) -> set[int]:
+    """Return the processes that a process has started or adopted; none on systems without `/proc`."""
+    return {process for process, above in _parents().items() if above == parent}
+
+
 def _started(worker: int, mark: str) -> set[int]:
     """Return the processes below a worker, and those that bear its mark."""
-    parents: dict[int, int] = {}
+    parents = _parents()
     found = {worker}
-    for folder in children(Path("/proc"), "[0-9]*"):
+    for process in parents:
         with suppress(OSError):  # it has ended, or belongs to another user
-            parents[int(folder.name)] = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
-            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
-                found.add(int(folder.name))
+            if f"{MARK}={mark}".encode() in Path(f"/proc/{process}/environ").read_bytes().split(b"\0"):
+                found.add(process)
     while more := {process for process, parent in parents.items() if parent in found} - found:
         found |= more
     return found
+
+
+def _parents() -> dict[int, int]:
+    parents = {}
+    for folder in children(Path("/proc"), "[0-9]*"):
+        with suppress(OSError):  # it has ended
+            parents[int(folder.name)] = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
+    return parents

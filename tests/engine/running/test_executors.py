@@ -18,7 +18,7 @@ import pytest
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors import choose, unit_requests
+from pano_mvs.engine.executors import choose, fork_server, unit_requests
 from pano_mvs.engine.executors import processes as worker_process
 from pano_mvs.engine.executors.choose import ExecutorRequest, SerialExecutor, make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
@@ -470,6 +470,7 @@ def test_stage_that_changed_meanwhile_is_not_mistaken_for_the_old_one(toy: Toy) 
 
 
 def test_workers_that_do_not_start_end_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fork_server, "_BOOT", "raise SystemExit('no room for a server')")
     monkeypatch.setattr(worker_process, "_BOOT", "raise SystemExit('no room for a worker')")
     with pytest.raises(PanoMvsError, match="no room for a worker"):
         run_with(toy, two_processes)
