@@ -10,6 +10,7 @@ id, and later with the exit status. It adopts what a worker leaves behind, and e
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -197,9 +198,11 @@ def serve(descriptor: int) -> None:
     worker.adopt_orphans()
     from pano_mvs.engine.executors.unit_requests import load_installed
 
+    gc.disable()  # hardly anything that is imported is ever freed
     load_installed()
     for name in _PRELOADED:
         importlib.import_module(name)
+    gc.freeze()  # collecting in a worker would copy all pages that it shares with this process
     asked = socket.socket(fileno=descriptor)
     woken, wake = os.pipe()
     for end in (woken, wake):
@@ -250,6 +253,7 @@ class _Server:
     def _become_worker(self, mark: str, streams: list[int]) -> None:
         """Be a worker; it does not return."""
         try:
+            gc.enable()
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             self._asked.close()
