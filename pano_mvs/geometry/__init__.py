@@ -34,11 +34,9 @@ from pano_mvs.geometry.lens_rig import FisheyeLens, LensRig
 from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import (
     pad_panorama,
-    positions_in_padded,
     roll_panorama,
     rotate_panorama,
     sample_panorama,
-    view_in_padded,
 )
 from pano_mvs.geometry.sphere import (
     UP,
@@ -80,7 +78,6 @@ __all__ = [
     "pad_panorama",
     "pixel_from_ray",
     "pixel_solid_angle",
-    "positions_in_padded",
     "quat_wxyz_from_rotation",
     "ranges_from_bearings",
     "ray_from_pixel",
@@ -97,5 +94,4 @@ __all__ = [
     "skew",
     "spiral_rays",
     "triangulate_bearings",
-    "view_in_padded",
 ]

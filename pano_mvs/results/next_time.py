@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
@@ -19,6 +18,18 @@ from pano_mvs.results.figures import median, share, significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import FAIR_CONSISTENT, compares_views
+
+
+def _nearest_others(centers: FloatArray, most: int) -> NDArray[np.intp]:
+    """Return the nearest other points of each point, (N, K), nearest first."""
+    most = min(most, len(centers) - 1)
+    near = np.empty((len(centers), most), np.intp)
+    for idx, center in enumerate(centers):  # a search tree would take longer to import
+        squared = ((centers - center) ** 2).sum(axis=1)
+        squared[idx] = np.inf
+        candidates = np.flatnonzero(squared <= np.partition(squared, most - 1)[most - 1])
+        near[idx] = candidates[np.argsort(squared[candidates], kind="stable")[:most]]
+    return near
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +48,7 @@ class CameraGroup:
         centers = np.array(poses.centers, np.float64).reshape(-1, 3)
         if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
             return None
-        count = len(centers)
-        found = scipy.spatial.cKDTree(centers).query(centers, k=min(count, 7))
-        distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
-        near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
-        own = near == np.arange(count)[:, None]
-        own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
-        neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
-        return CameraGroup(number, poses, centers, neighbours, coverage)
+        return CameraGroup(number, poses, centers, _nearest_others(centers, 6), coverage)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -30,12 +30,16 @@ def write_code_listing(out: Path, workflow: Workflow) -> None:
         if _read(out).get("digests") == digests:
             return
         by_stage = {name: code_functions(entry.spec, entry.params) for name, entry in entries}
-        files: list[tuple[str, Mapping[str, str]]] = []  # files of plugins in two folders may have the same name
-        stages: dict[str, list[int]] = {}
-        for name, found in by_stage.items():
-            files += [file for file in found.items() if file not in files]
-            stages[name] = [files.index(file) for file in found.items()]
-        value = {"schema": _SCHEMA, "digests": digests, "files": files, "stages": stages}
+        # Files of plugins in two folders may have the same name; the functions of a file are one object.
+        files = {
+            (name, id(functions)): (name, functions) for found in by_stage.values() for name, functions in found.items()
+        }
+        places = {file: place for place, file in enumerate(files)}
+        stages = {
+            stage: [places[name, id(functions)] for name, functions in found.items()]
+            for stage, found in by_stage.items()
+        }
+        value = {"schema": _SCHEMA, "digests": digests, "files": list(files.values()), "stages": stages}
         write_text(out / LOG_FOLDER / CODE_JSON, json.dumps(value))
 
 

@@ -14,13 +14,12 @@ from pano_mvs.geometry import (
     kernels_sphere,
     pad_panorama,
     pixel_from_ray,
-    positions_in_padded,
     ray_from_pixel,
     ray_grid,
     rotation_from_rotvec,
     sample_panorama,
-    view_in_padded,
 )
+from pano_mvs.geometry.positions import positions_in_padded, view_in_padded
 
 pytestmark = pytest.mark.kernel("geometry.kernels_sphere")
 

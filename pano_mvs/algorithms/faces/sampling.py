@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import PinholeView, pad_panorama, positions_in_padded, ray_from_pixel, ray_grid, view_in_padded
+from pano_mvs.geometry import PinholeView, pad_panorama, ray_from_pixel, ray_grid
+from pano_mvs.geometry.positions import positions_in_padded, view_in_padded
 from pano_mvs.scene.poses import Poses
 from pano_mvs.scene.upright import world_up
 

@@ -23,7 +23,8 @@ from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import pad_panorama, positions_in_padded
+from pano_mvs.geometry import pad_panorama
+from pano_mvs.geometry.positions import positions_in_padded
 from pano_mvs.scene import Features
 
 _PAD_PX = 4

@@ -17,7 +17,8 @@ from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoi
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import PinholeView, pad_panorama, view_in_padded
+from pano_mvs.geometry import PinholeView, pad_panorama
+from pano_mvs.geometry.positions import view_in_padded
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.learned.networks import packaged_network
 from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.geometry import PinholeView, pad_panorama, positions_in_padded, ray_grid, rotation_from_rotvec
+from pano_mvs.geometry import PinholeView, pad_panorama, ray_grid, rotation_from_rotvec
+from pano_mvs.geometry.positions import positions_in_padded
 
 SIDE_PX = 256
 """Width and height of the pictures that the networks read."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, positions_in_padded, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
+from pano_mvs.geometry.positions import positions_in_padded
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 

@@ -24,6 +24,7 @@ from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import checked_body, write_checked
 from pano_mvs.core.kernel_cache import user_cache_folder
+from pano_mvs.core.paths import below
 from pano_mvs.engine.stages.params import Params, registered_files
 from pano_mvs.engine.stages.stage import StageCode, StageSpec
 
@@ -91,17 +92,7 @@ def code_functions(spec: StageSpec, params: Params) -> dict[str, Mapping[str, st
             outer = _outer_of(found, roots, own_digest)
             inner.collect([one for name in outer for one in ours.files(name)], ours)
             paths |= inner.paths
-    return {
-        name: (_our_functions if path.is_relative_to(_OURS) else _functions_of)(path)
-        for name, path in sorted(paths.items())
-    }
-
-
-def _functions_of(path: Path) -> Mapping[str, str]:
-    return _parsed(path.read_text(encoding="utf-8-sig"))[2]
-
-
-_our_functions = cache(_functions_of)  # these do not change while a process runs
+    return {name: _parsed_file(path)[2] for name, path in sorted(paths.items())}
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +244,7 @@ class _Roots:
 
     def name_of(self, path: Path) -> str:
         """Return a file's name without the folder into which its package is installed."""
-        return path.relative_to(self.base).as_posix() if path.is_relative_to(self.base) else str(path)
+        return _name_below(path, self.base)
 
     def files(self, dotted: str) -> list[Path]:
         top = dotted.partition(".")[0]
@@ -262,6 +253,11 @@ class _Roots:
         if self.package is not None and top == self.package.name:
             found += (_our_files if self.package == _OURS else _module_files)(self.package.parent, dotted)
         return found
+
+
+@cache
+def _name_below(path: Path, base: Path) -> str:
+    return path.relative_to(base).as_posix() if path.is_relative_to(base) else str(path)
 
 
 @dataclass(slots=True)
@@ -291,7 +287,7 @@ class _Code:
 def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
     """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
-        digest, imports, _ = _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
+        digest, imports, _ = _parsed_file(path)
     except SyntaxError as error:
         error.filename = str(path)
         raise
@@ -316,7 +312,7 @@ def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
 @cache
 def _homes_in_api() -> dict[str, str]:
     """Return the modules of the names that `pano_mvs.api` passes on, most of which a stage does not use."""
-    imports = _parsed((_OURS / "api" / "__init__.py").read_text(encoding="utf-8"))[1]
+    imports = _parsed_file(_OURS / "api" / "__init__.py")[1]
     return {name: module for _, module, names in imports for name in names}
 
 
@@ -329,10 +325,25 @@ def _module_files(base: Path, dotted: str) -> list[Path]:
     candidates = [base.joinpath(*parts[: depth + 1], "__init__.py") for depth in range(len(parts))]
     if parts:
         candidates.append(base.joinpath(*parts).with_suffix(".py"))
-    return [candidate for candidate in candidates if candidate.is_file()]
+    return [candidate for candidate in candidates if candidate in _our_paths() or candidate.is_file()]
 
 
 _our_files = cache(_module_files)
+
+
+def _parsed_file(path: Path) -> _Parsed:
+    """Return what `_parsed` does, of a file; ours do not change while a process runs."""
+    return _our_parsed(path) if path in _our_paths() else _parsed(path.read_text(encoding="utf-8-sig"))
+
+
+@cache
+def _our_parsed(path: Path) -> _Parsed:
+    return _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
+
+
+@cache
+def _our_paths() -> frozenset[Path]:
+    return frozenset(below(_OURS, "*.py"))
 
 
 @lru_cache(maxsize=4096)
