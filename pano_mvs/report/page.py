@@ -5,14 +5,19 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections import Counter
+from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+import jinja2
+from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined
+from jinja2.bccache import Bucket
 from markupsafe import Markup
 
-from pano_mvs.core.files import write_text
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.files import make_folder, write_text
+from pano_mvs.core.kernel_cache import user_cache_folder
 from pano_mvs.core.text import duration_text, plural
 from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather, stage_groups
 from pano_mvs.report.earlier_page import EarlierPage
@@ -80,6 +85,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=_kept_templates(),
     )
     environment.filters |= {
         "share": figures.share,
@@ -93,6 +99,33 @@ def _environment() -> Environment:
         "pixels": lambda size_hw: f"{size_hw[1]} × {size_hw[0]} px",
     }
     return environment
+
+
+class _KeptTemplates(FileSystemBytecodeCache):
+    """Compiled templates: compiling them takes longer than all else. A file that is of no use costs only time."""
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Load a compiled template, if it was kept."""
+        try:
+            super().load_bytecode(bucket)
+        except Exception:  # a damaged file may raise anything
+            bucket.reset()
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep a compiled template."""
+        with suppress(OSError):
+            super().dump_bytecode(bucket)
+
+
+def _kept_templates() -> _KeptTemplates | None:
+    """Return a cache in the user's folder for caches; None if it cannot be written."""
+    try:
+        folder = user_cache_folder() / "pano-mvs" / "templates"
+        make_folder(folder)
+    except OSError:
+        return None
+    compiled_by = digest_from_value([jinja2.__version__, Path(__file__).read_bytes()])  # another one may differ
+    return _KeptTemplates(str(folder), f"{compiled_by[:8]}-%s.cache")
 
 
 def _source(script: str) -> str:

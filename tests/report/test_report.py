@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pano_mvs.report import page as page_module
 from pano_mvs.report import write_report
 from pano_mvs.report.content import capture_facts, capture_name, date_in_words
 from pano_mvs.report.view_cards import chosen_views
@@ -240,6 +241,33 @@ def test_any_key_may_be_missing_or_empty(out_dir: Path, key: str | None) -> None
 def test_any_key_of_the_poses_may_be_missing(out_dir: Path, key: str) -> None:
     poses = {name: value for name, value in SUMMARY["poses"].items() if name != key}
     assert_sound(reported(out_dir, SUMMARY | {"poses": poses}))
+
+
+@pytest.mark.parametrize("state", ["new", "damaged", "in the way", "missing"])
+def test_compiled_templates_are_kept_where_that_is_possible(
+    out_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    before = reported(out_dir, SUMMARY).source
+
+    def folder() -> Path:
+        if state == "missing":
+            raise OSError("nowhere")
+        return tmp_path
+
+    monkeypatch.setattr(page_module, "user_cache_folder", folder)
+    page_module._environment.cache_clear()
+    assert reported(out_dir, SUMMARY).source == before
+    kept = list((tmp_path / "pano-mvs" / "templates").glob("*.cache"))
+    assert (len(kept) > 5) == (state != "missing")
+    for path in kept:
+        if state == "damaged":
+            path.write_bytes(path.read_bytes()[:50])
+        elif state == "in the way":
+            path.unlink()
+            path.mkdir()
+    page_module._environment.cache_clear()
+    assert reported(out_dir, SUMMARY).source == before
+    page_module._environment.cache_clear()
 
 
 def test_only_our_own_script_may_run(out_dir: Path) -> None:
