@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from pano_mvs.core.doors import own_packages
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import checked_body, write_checked
 from pano_mvs.core.kernel_cache import user_cache_folder
-from pano_mvs.core.paths import below
+from pano_mvs.core.paths import below, children
 from pano_mvs.engine.stages.params import Params, registered_files
 from pano_mvs.engine.stages.stage import StageCode, StageSpec
 
@@ -251,7 +252,8 @@ class _Roots:
         # pano_mvs is loaded before any plugin, so a checkout of it beside a plugin is not what the plugin gets.
         found = [] if self.folder is None or top == _OURS.name else _module_files(self.folder, dotted)
         if self.package is not None and top == self.package.name:
-            found += (_our_files if self.package == _OURS else _module_files)(self.package.parent, dotted)
+            ours = self.package == _OURS
+            found += _our_files(dotted) if ours else _module_files(self.package.parent, dotted)
         return found
 
 
@@ -325,10 +327,23 @@ def _module_files(base: Path, dotted: str) -> list[Path]:
     candidates = [base.joinpath(*parts[: depth + 1], "__init__.py") for depth in range(len(parts))]
     if parts:
         candidates.append(base.joinpath(*parts).with_suffix(".py"))
-    return [candidate for candidate in candidates if candidate in _our_paths() or candidate.is_file()]
+    return [candidate for candidate in candidates if candidate.is_file()]
 
 
-_our_files = cache(_module_files)
+@cache
+def _our_files(dotted: str) -> list[Path]:
+    """Return what `_module_files` does for a name in pano_mvs, without asking the disk for each."""
+    parts = dotted.split(".")
+    above = (".".join(parts[:depth]) for depth in range(1, len(parts) + 1))
+    found = ((name, path) for name in above if (path := _our_modules().get(name)) is not None)
+    return [path for name, path in found if name == dotted or path.name == "__init__.py"]
+
+
+@cache
+def _our_modules() -> Mapping[str, Path]:
+    """Return all modules of pano_mvs by their dotted names, packages with their __init__.py."""
+    paths = {path: path.relative_to(_OURS.parent).with_suffix("").parts for path in _our_paths()}
+    return {".".join(parts[:-1] if parts[-1] == "__init__" else parts): path for path, parts in paths.items()}
 
 
 def _parsed_file(path: Path) -> _Parsed:
@@ -407,7 +422,8 @@ def _imports_in(tree: ast.AST) -> Iterator[_Import]:
 
 
 def _kept_place() -> Path:
-    return user_cache_folder() / "pano-mvs" / "code" / f"{sys.version_info.major}.{sys.version_info.minor}.json"
+    """Return the file of this version, so that two versions in turn do not parse all modules again and again."""
+    return user_cache_folder() / "pano-mvs" / "code" / f"{_parser()[:16]}.json"
 
 
 @cache
@@ -435,6 +451,10 @@ def _keep_parsed() -> None:
         with suppress(StoreError, OSError, RuntimeError):  # a user without a home
             place, body = _kept_place(), json.dumps([_parser(), dict(list(known.items())[-4000:])])
             write_checked(place, body.encode(), temporary_in=place.parent)
+            for other in children(place.parent, "*.json"):
+                if time.time() - other.stat().st_mtime > _FORGOTTEN_S:
+                    other.unlink(missing_ok=True)
 
 
+_FORGOTTEN_S = 60 * 24 * 3600.0  # after which what a version has parsed is removed; it can be parsed again
 _kept_counts: list[int] = []

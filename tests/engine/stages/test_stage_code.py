@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import shutil
 import sys
 import threading
@@ -202,9 +203,13 @@ def test_what_another_version_parsed_is_not_read(tmp_path: Path, monkeypatch: py
     assert list(known()) == ["text"]
     stage_code_module._keep_parsed()
     assert place.stat().st_mtime_ns == written  # nothing is new
+    os.utime(place, (0, 0))
     monkeypatch.setattr(stage_code_module, "_parser", lambda: "later")
     known.cache_clear()
     assert known() == {}
+    known()["text"] = "digest", (), {}
+    stage_code_module._keep_parsed()
+    assert [path.name for path in place.parent.iterdir()] == ["later.json"]  # the other one was not used for long
     known.cache_clear()
 
 
