@@ -22,8 +22,8 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -110,23 +110,17 @@ class ForkServer:
                 self._start()
             if not self._works or self._socket is None:
                 return None
-            with errors.open("wb") as said:
-                stdin, to_worker = os.pipe()
-                from_worker, stdout = os.pipe()
+            with errors.open("wb") as said, _pipes() as ((stdin, to_worker), (from_worker, stdout)):
                 try:
                     message = json.dumps({"mark": mark}).encode()
                     socket.send_fds(self._socket, [message], [stdin, stdout, said.fileno()])
                     pid = self._pids.get(timeout=_START_S)
                 except (OSError, queue.Empty):
                     pid = 0
-                finally:
-                    os.close(stdin)
-                    os.close(stdout)
-            if not pid:
-                self._works = False
-                os.close(to_worker)
-                os.close(from_worker)
-                return None
+                if not pid:
+                    self._works = False
+                    return None
+                to_worker, from_worker = os.dup(to_worker), os.dup(from_worker)
             forked = ForkedProcess(pid, os.fdopen(to_worker, "wb"), os.fdopen(from_worker, "rb"))
             with self._state:
                 self._running[pid] = forked
@@ -190,6 +184,18 @@ class ForkServer:
                 self._ended_early[pid] = status
         if process is not None:
             process.note_end(status)
+
+
+@contextmanager
+def _pipes() -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Open two pipes, and close them."""
+    with ExitStack() as opened:
+        pipes = []
+        for _ in range(2):
+            pipes.append(os.pipe())
+            for end in pipes[-1]:
+                opened.callback(os.close, end)
+        yield pipes[0], pipes[1]
 
 
 def serve(descriptor: int) -> None:
