@@ -11,7 +11,7 @@ from tests.cli.conftest import (
     pano_mvs,
     quickstart,
     rendered,
-    sample_cache,
+    sample,
     toy,
 )
 from tests.conftest import mine, pytest_collection_finish

@@ -84,9 +84,18 @@ def made_once(folder: Path, make: Callable[[Path], None]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def sample_cache(of_all_processes: Path) -> Path:
-    """A cache for all that runs the quickstart on the sample, in all processes of the test run: it is computed once."""
-    return of_all_processes / "sample-cache"
+def sample(of_all_processes: Path) -> Path:
+    """Folder with output and cache of the quickstart on the sample, as the examples of the documentation run it.
+
+    Nobody is to change `out`; whoever runs the sample with `cache` computes little.
+    """
+
+    def run(folder: Path) -> None:
+        places = ("--out", folder / "out", "--cache", folder / "cache")
+        result = CliRunner().invoke(app, ["run", "quickstart", *map(str, places), "--set", "depth.planes=96"])
+        assert result.exit_code == 0, result.output
+
+    return made_once(of_all_processes / "sample", run)
 
 
 @pytest.fixture

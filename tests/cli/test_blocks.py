@@ -511,6 +511,7 @@ def test_a_rendered_capture_in_blocks_is_one_model_and_resumes_from_the_cache(
         "run", "known_poses", "--images", tmp_path / "capture/images", "--out", "out", "--cache", "cache",
         "--set", f"poses.path={tmp_path / 'capture/truth/poses.json'}", "--set", "depth.planes=16",
         "--set", "features.max_keypoints=400", "--executor", "serial", "--block-size", "7", "--block-overlap", "3",
+        "--set", "views.sources=2", "--set", "depth.near=0.4", "--set", "depth.far=8",
     )  # fmt: skip
 
     def checked(result: Outcome) -> dict[str, bytes]:
@@ -629,6 +630,7 @@ def test_blocks_of_a_rendered_room_become_one_model_of_it(pano_mvs: Command, tmp
         block = pano_mvs(
             "run", "quickstart", "--images", tmp_path / f"blocks/block_{number}", "--out", f"out/{number}",
             "--cache", tmp_path / "cache", *SMALL, "--set", "weak.learned=never", "--set", "previews=null",
+            "--set", "depth.near=1", "--set", "depth.far=40",
         )  # fmt: skip
         assert block.code in (0, 3), block.text
     result = pano_mvs("merge", "out/1", "out/2", "--out", "out/merged")

@@ -38,9 +38,9 @@ def test_examples_of_a_module(module: str) -> None:
 
 
 @pytest.mark.slow
-def test_examples_that_run_the_sample(tmp_path: Path, sample_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_that_run_the_sample(tmp_path: Path, sample: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PANO_MVS_CACHE", str(sample_cache))
+    monkeypatch.setenv("PANO_MVS_CACHE", str(sample / "cache"))
     for module in COMPUTING:
         failed, tried = examples(module)
         assert (failed, tried > 0) == (0, True), module

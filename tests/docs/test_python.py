@@ -46,18 +46,11 @@ def test_the_notebook_is_in_version_4_of_the_format_and_holds_no_output() -> Non
 
 @pytest.mark.slow
 def test_the_notebook_runs(
-    tmp_path: Path, sample_cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, sample: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its range maps and poses are shown, and are those of the sample, which is reduced."""
+    """Its range maps and poses are shown, and are those of the sample."""
     monkeypatch.chdir(tmp_path)
-    run = pano_mvs.run
-    smaller = {"images.max_width": 448, "features.max_keypoints": 3000, "weak.learned": "never"}
-
-    def run_smaller(*arguments: Any, settings: dict[str, Any], **named: Any) -> pano_mvs.RunOutput:
-        return run(*arguments, settings=settings | smaller, **named)
-
-    monkeypatch.setattr(pano_mvs, "run", run_smaller)
-    monkeypatch.setenv("PANO_MVS_CACHE", str(sample_cache))
+    monkeypatch.setenv("PANO_MVS_CACHE", str(sample / "cache"))
     mpl.use("agg")
     names: dict[str, Any] = {"__name__": "notebook"}
     shown = []

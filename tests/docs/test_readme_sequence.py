@@ -23,13 +23,14 @@ SAMPLE = ROOT / "workflows" / "samples" / "classroom" / "images"
 NAMES = ("hall.jpg", "kitchen.jpg", "lobby.jpg", "stairs.jpg")
 SMALLER = {
     "images.max_width": 256,
+    "views.sources": 2,
     "depth.planes": 24,
     "features.max_keypoints": 2000,
     "weak.learned": "never",
     "scene_planes.min_share": 0.1,
 }
-OF_SAMPLE = {"images.max_width": 416}  # has the pixel that is inspected
-MISSING = {"quickstart": ("scene_planes",), "known_poses": ("scene_planes", "weak")}  # stages
+OF_SAMPLE = {"depth.planes": 96}  # as in the cache
+MISSING = {"known_poses": ("scene_planes", "weak")}  # stages
 NOT_RUN = ("pip", "docker", "pytest", "activate")
 
 
@@ -52,23 +53,25 @@ def smaller(arguments: list[str]) -> list[str]:
         return [*arguments, "--screenshot", "view.png"]
     if arguments[0] not in ("run", "tour"):
         return arguments
-    settings = SMALLER | (OF_SAMPLE if arguments[1] == "quickstart" else {})
+    settings = OF_SAMPLE if arguments[1] == "quickstart" else SMALLER
     missing = MISSING.get(arguments[1], ())
     given = [f"{name}={value}" for name, value in settings.items() if name.partition(".")[0] not in missing]
-    given += ["textured.texture_px=512", "textured.cell=0.1"] if arguments[0] == "tour" else []
+    given += (
+        ["textured.texture_px=512", "textured.cell=0.1", "textured.triangles=2000"] if arguments[0] == "tour" else []
+    )
     quiet = ["--no-open"] if arguments[0] == "tour" else []
     return [*arguments, *quiet, *(word for setting in given for word in ("--set", setting))]
 
 
 @pytest.mark.slow
-def test_the_commands_run_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_run_one_after_the_other(tmp_path: Path, sample: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lobby = tmp_path / "photos" / "lobby"
     lobby.mkdir(parents=True)
     for name, path in zip(NAMES, sorted(SAMPLE.iterdir()), strict=True):
         cv2.imwrite(str(lobby / name), read_picture(path))
     shutil.copytree(ROOT / "workflows", tmp_path / "workflows", ignore=shutil.ignore_patterns(".pano-mvs"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
+    monkeypatch.setenv("PANO_MVS_CACHE", str(sample / "cache"))
     monkeypatch.setenv("COLUMNS", "200")
     for _, script in sequences():
         for arguments in commands(script):

@@ -62,7 +62,7 @@ def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_runs_lose_nothing() -> None:
-    assert kills.main(3) == 0
+    assert kills.main(3, executor="serial") == 0
 
 
 def test_a_hundred_tries_meet_each_fault_and_each_stage() -> None:
@@ -80,19 +80,30 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> faults.Clean:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind",
-    ["a second run starts", "SIGSTOP of all", "stalls", "becomes read-only", "ulimit", "output folder is removed"],
+    ("kind", "executor"),
+    [
+        ("a second run starts", "serial"),
+        ("SIGSTOP of all", "processes"),
+        ("stalls", "processes"),
+        ("becomes read-only", "serial"),
+        ("ulimit", "processes"),
+        ("output folder is removed", "serial"),
+    ],
 )
-def test_nothing_is_lost_whatever_happens_around_a_run(clean: faults.Clean, tmp_path: Path, kind: str) -> None:
+def test_nothing_is_lost_whatever_happens_around_a_run(
+    clean: faults.Clean, tmp_path: Path, kind: str, executor: str
+) -> None:
     fault = next(fault for fault in faults.FAULTS if kind in fault.kind)
+    number = fault.executors.index(executor)
     try:
-        assert faults.attempt(fault, clean, 0, folder=tmp_path / "try", pause_s=4) == []
+        assert faults.attempt(fault, clean, number, folder=tmp_path / "try", pause_s=3) == []
     except ImpossibleHereError as error:
         pytest.skip(str(error))
 
 
 @pytest.mark.slow
 def test_bad_items_killed_workers_and_a_full_disk_cost_the_bad_items_alone(tmp_path: Path) -> None:
-    verdict = load.load(tmp_path, count=20, bad=10, kills=1, every_s=1.0)
+    """Without the bad items that end their workers, each of which costs three more: see test_executors.py."""
+    verdict = load.load(tmp_path, count=14, bad=7, kills=1, every_s=1.0)
     assert verdict.wrong == []
     assert verdict.runs >= 2  # the first one found the disk full

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -22,7 +23,9 @@ from plugin_trees import STAGE, write_library, write_plugin, write_project
 
 import pano_mvs as product
 from pano_mvs.api import InputError
+from pano_mvs.cli.doctor.checks import plugin_findings
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.cli.conftest import Command, deliverables, run_json
 from tests.docs.pages import block
@@ -48,17 +51,46 @@ def slow(panorama: Each[Panorama], ctx: Context) -> Files:
     return Files({})
 """
 
+SOURCE = '''
+from pano_mvs.api import InputError, Panorama, Params, SourceItem, SourcePath, decode_image, is_only_planned, source
+
+
+class ListedParams(Params):
+    path: SourcePath
+
+
+def listed(params):
+    if not params.path.is_dir():
+        raise InputError(f"{params.path}: is not a folder. Correct the path")
+    if params.path.name == "broken":
+        raise RuntimeError("no luck")
+    for path in sorted(params.path.glob("*.png")):
+        yield SourceItem(path.name, {"image": path}, notes=("planned" if is_only_planned.get() else "run",))
+
+
+@source("source.listed", list_items=listed)
+def read(item: SourceItem, params: ListedParams) -> Panorama:
+    """Read a panorama."""
+    return Panorama(item.file("image"), (32, 64), (32, 64))
+'''
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with two plugins that need different versions of a library; both are installed."""
+    """A folder with two plugins that need different versions of a library; both are installed.
+
+    The second has a source and a stage that takes for ever as well.
+    """
     folder = tmp_path_factory.mktemp("a  place für plugins")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setenv("PANO_MVS_ENVIRONMENTS", str(folder / "environments"))
         for name, version in (("one", "1.0"), ("two", "2.0")):
             library = write_library(folder / f"shared lib {version}", version)
-            installed = install_plugin(write_plugin(folder / name, name, library))
-            assert (installed.environment, installed.stages) == ("overlay", (f"export.{name}",))
+            more = f"{SLOW}\n{SOURCE}" if name == "two" else ""
+            text = f"{STAGE.format(name=name, title=name.capitalize())}\n{more}"
+            installed = install_plugin(write_plugin(folder / name, name, library, text=text))
+            others = {"export.slow", "source.listed"} if more else set()
+            assert (installed.environment, {*installed.stages}) == ("overlay", {f"export.{name}", *others})
         images = sorted((tiny_capture(Variant((32, 64))).folder / "images").iterdir())
         (folder / "photos").mkdir()
         for path in images[:2]:
@@ -98,11 +130,11 @@ def test_two_versions_of_a_library_work_in_one_run(installed: Path, pano_mvs: Co
         assert other.code == 0, other.text
         assert {n: t for n, t in deliverables(Path("out", executor)).items() if n.endswith(".txt")} == found
         no_processes_in(installed)
-    isolated = ("--executor", "processes", "--isolate", "--set", "two=null", "--cache", "i", "--out", "out/i")
-    alone = pano_mvs("run", "wf.yaml", *isolated)
+    isolated = ("--executor", "processes", "--workers", "1", "--isolate", "--cache", "i", "--out", "out/i")
+    alone = pano_mvs("run", "wf.yaml", *isolated, "--only", "one:000.png")
     assert alone.code == 0, alone.text
-    by_one = {name: text for name, text in found.items() if name.startswith("one/")}
-    assert {name: text for name, text in deliverables(Path("out/i")).items() if name.endswith(".txt")} == by_one
+    in_one = {name: text for name, text in found.items() if name.startswith("one/000")}
+    assert {name: text for name, text in deliverables(Path("out/i")).items() if name.endswith(".txt")} == in_one
 
 
 def test_what_is_wrong_is_said_as_of_any_stage(installed: Path, pano_mvs: Command) -> None:
@@ -129,10 +161,26 @@ def test_settings_are_asked_about_once(installed: Path, pano_mvs: Command) -> No
     assert time.perf_counter() - started < 1.5
 
 
-def test_changed_code_has_other_keys(installed: Path, pano_mvs: Command) -> None:
+def copy_instead_of_pip(monkeypatch: pytest.MonkeyPatch, environment: Path, package: Path) -> None:
+    """Let what is installed be a copy of an environment with the code of a package, which saves the work of pip."""
+
+    def copied(folder: Path, *_: object) -> None:
+        shutil.copytree(environment, folder, symlinks=True)
+        (there,) = folder.rglob(f"{package.name}/__init__.py")
+        shutil.rmtree(there.with_name("__pycache__"), ignore_errors=True)
+        shutil.copy(package / "__init__.py", there)
+
+    monkeypatch.setattr("pano_mvs_environments.install.build", copied)
+
+
+def test_changed_code_has_other_keys(
+    installed: Path, tmp_path: Path, pano_mvs: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert pano_mvs("run", "wf.yaml", "--executor", "serial").code == 0
     source = installed / "one" / "one" / "__init__.py"
     before, folder = source.read_text(), environments()[0].folder
+    kept = shutil.copytree(folder, tmp_path / "kept", symlinks=True)
+    copy_instead_of_pip(monkeypatch, kept, source.parent)
     assert not install_plugin(installed / "one").is_new
     try:
         source.write_text("# only a comment\n" + before)
@@ -156,12 +204,10 @@ def test_a_broken_environment_is_found_and_made_again(installed: Path, pano_mvs:
     (one,) = (one for one in environments() if one.name == "one")
     library = next(Path(one.folder).rglob("shared_lib"))
     shutil.rmtree(library)
-    (problem,) = (found.problem for found in plugin_environments(check=True) if found.problem)
-    assert "No module named 'shared_lib'" in problem
-    doctor = pano_mvs("doctor", "--json")
-    found = {one["what"]: one for one in json.loads(doctor.text)["findings"] if one["group"] == "plugins"}
-    assert (found["one 1.0"]["state"], found["two 1.0"]["state"]) == ("warning", "ok")
-    assert found["one 1.0"]["remedy"] == f"run `pano-mvs plugin install '{installed / 'one'}'`, which makes it again"
+    found = {finding.what: finding for finding in plugin_findings(Registry.installed(), presets_folder())}
+    assert (found["one 1.0"].state, found["two 1.0"].state) == ("warning", "ok")
+    assert "No module named 'shared_lib'" in found["one 1.0"].detail
+    assert found["one 1.0"].remedy == f"run `pano-mvs plugin install '{installed / 'one'}'`, which makes it again"
     for own in (("--executor", "serial"), ("--executor", "processes", "--workers", "1")):
         result = pano_mvs("run", "wf.yaml", *own, "--keep-going", "--cache", own[1])
         assert result.code == 3, result.text
@@ -173,19 +219,15 @@ def test_a_broken_environment_is_found_and_made_again(installed: Path, pano_mvs:
 
 
 def test_a_unit_that_takes_too_long_is_ended(installed: Path, pano_mvs: Command) -> None:
-    install_plugin(write_plugin(installed / "slow", "slow", None, text=SLOW))
-    try:
-        images = json.dumps(str(installed / "photos"))
-        stages = f"images: {{use: source.folder, path: {images}}}\n  slow: {{use: export.slow, timeout_s: 2}}\n"
-        Path("slow.yaml").write_text(f"pano_mvs: 1\nstages:\n  {stages}")
-        result = pano_mvs("run", "slow.yaml", "--executor", "processes", "--workers", "1", "--only", "slow:000.png")
-        assert result.code == 3, result.text
-        assert "it took longer than timeout_s: 2, and was ended" in result.flat
-        no_processes_in(installed)
-        interrupt_a_serial_run(installed)
-        no_processes_in(installed)
-    finally:
-        assert pano_mvs("plugin", "remove", "slow").code == 0
+    images = json.dumps(str(installed / "photos"))
+    stages = f"images: {{use: source.folder, path: {images}}}\n  slow: {{use: export.slow, timeout_s: 2}}\n"
+    Path("slow.yaml").write_text(f"pano_mvs: 1\nstages:\n  {stages}")
+    result = pano_mvs("run", "slow.yaml", "--executor", "processes", "--workers", "1", "--only", "slow:000.png")
+    assert result.code == 3, result.text
+    assert "it took longer than timeout_s: 2, and was ended" in result.flat
+    no_processes_in(installed)
+    interrupt_a_serial_run()
+    no_processes_in(installed)
 
 
 def no_processes_in(folder: Path) -> None:
@@ -193,7 +235,7 @@ def no_processes_in(folder: Path) -> None:
     assert str(folder / "environments") not in listed
 
 
-def interrupt_a_serial_run(folder: Path) -> None:
+def interrupt_a_serial_run() -> None:
     """Interrupt a run in the middle of a unit of an environment."""
     command = [sys.executable, "-m", "pano_mvs", "run", "slow.yaml", "--executor", "serial", "--cache", "interrupted"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -261,18 +303,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_plugin_that_cannot_have_an_environment_is_refused(
     installed: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, text: str, why: str
 ) -> None:
-    """Its environment is a copy of another one with the code of this plugin, which saves the work of pip."""
-
-    def copied(folder: Path, *_: object) -> None:
-        shutil.copytree(built, folder, symlinks=True)
-        (package,) = folder.rglob("bad/__init__.py")
-        package.write_text(text)
-        shutil.rmtree(package.with_name("__pycache__"), ignore_errors=True)
-
-    monkeypatch.setattr("pano_mvs_environments.install.build", copied)
+    plugin = write_plugin(tmp_path / "bad", "bad", None, text=text)
+    copy_instead_of_pip(monkeypatch, built, plugin / "bad")
     before = sorted((installed / "environments").iterdir()), (installed / "environments/environments.json").read_text()
     with pytest.raises(InputError) as raised:
-        install_plugin(write_plugin(tmp_path / "bad", "bad", None, text=text))
+        install_plugin(plugin)
     assert why in str(raised.value)
     after = sorted((installed / "environments").iterdir()), (installed / "environments/environments.json").read_text()
     assert after == before
@@ -326,53 +361,25 @@ def stage_named(name: str) -> str:
     return STAGE.replace("import shared_lib\n", "").format(name=name, title=name.capitalize())
 
 
-SOURCE = '''
-from pano_mvs.api import InputError, Panorama, Params, SourceItem, SourcePath, decode_image, is_only_planned, source
-
-
-class ListedParams(Params):
-    path: SourcePath
-
-
-def listed(params):
-    if not params.path.is_dir():
-        raise InputError(f"{params.path}: is not a folder. Correct the path")
-    if params.path.name == "broken":
-        raise RuntimeError("no luck")
-    for path in sorted(params.path.glob("*.png")):
-        yield SourceItem(path.name, {"image": path}, notes=("planned" if is_only_planned.get() else "run",))
-
-
-@source("source.listed", list_items=listed)
-def read(item: SourceItem, params: ListedParams) -> Panorama:
-    """Read a panorama."""
-    return Panorama(item.file("image"), (32, 64), (32, 64))
-'''
-
-
-def test_a_source_lists_its_items_in_its_own_process(installed: Path, tmp_path: Path, pano_mvs: Command) -> None:
-    install_plugin(write_plugin(tmp_path / "listed", "listed", None, text=SOURCE))
+def test_a_source_lists_its_items_in_its_own_process(installed: Path, pano_mvs: Command) -> None:
     shutil.copytree(installed / "photos", "photos")
     Path("listed.yaml").write_text(
-        "pano_mvs: 1\nstages:\n  images: {use: source.listed, path: photos}\n  one: {use: export.one}\n"
+        "pano_mvs: 1\nstages:\n  images: {use: source.listed, path: photos}\n  two: {use: export.two}\n"
     )
-    try:
-        result = pano_mvs("run", "listed.yaml", "--executor", "serial")
-        assert result.code == 0, result.text
-        count = len(list(Path("photos").glob("*.png")))
-        assert units(run_json(Path("out/listed"))) == {"images": (count, 0), "one": (count, 0)}
-        assert "note: run" in result.flat
-        result = pano_mvs("plan", "listed.yaml")
-        assert (result.code, "nothing to compute" in result.flat) == (0, True), result.text
-        Path("photos").rename("broken")
-        result = pano_mvs("plan", "listed.yaml", "--set", "images.path=broken")
-        assert result.code == 2
-        assert "error: source source.listed cannot list its items: " in result.flat
-        assert "listed/__init__.py:13: RuntimeError: no luck" in result.flat
-        result = pano_mvs("plan", "listed.yaml", "--set", "images.path=wf.yaml")
-        assert (result.code, "wf.yaml: is not a folder. Correct the path" in result.flat) == (2, True), result.text
-    finally:
-        product.remove_plugin("listed")
+    result = pano_mvs("run", "listed.yaml", "--executor", "serial")
+    assert result.code == 0, result.text
+    count = len(list(Path("photos").glob("*.png")))
+    assert units(run_json(Path("out/listed"))) == {"images": (count, 0), "two": (count, 0)}
+    assert "note: run" in result.flat
+    result = pano_mvs("plan", "listed.yaml")
+    assert (result.code, "nothing to compute" in result.flat) == (0, True), result.text
+    Path("photos").rename("broken")
+    result = pano_mvs("plan", "listed.yaml", "--set", "images.path=broken")
+    assert result.code == 2
+    assert "error: source source.listed cannot list its items: " in result.flat
+    assert re.search(r"two/__init__\.py:\d+: RuntimeError: no luck", result.flat), result.text
+    result = pano_mvs("plan", "listed.yaml", "--set", "images.path=wf.yaml")
+    assert (result.code, "wf.yaml: is not a folder. Correct the path" in result.flat) == (2, True), result.text
 
 
 def test_an_isolated_environment_sees_pano_mvs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -444,6 +451,7 @@ def test_stages_in_environments_have_the_code_that_they_have_there(installed: Pa
 
 def test_the_commands_in_the_guide_work(installed: Path, pano_mvs: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """The package that `plugin new` writes is installed, passes its own tests there, and is removed."""
+    monkeypatch.setattr("pano_mvs.cli.doctor.libraries._LIBRARIES", ())  # each is tried in a process of its own
     monkeypatch.setenv("PIP_NO_BUILD_ISOLATION", "0")  # pip reads this as a yes; hatchling is installed here
     commands = [command.split()[1:] for command in block("plugins.md", "environment").splitlines()]
     assert [command[:2] for command in commands][:2] == [["plugin", "new"], ["plugin", "install"]]

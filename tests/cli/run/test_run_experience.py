@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from pano_mvs.cli.app import app
 from pano_mvs.cli.commands import COMMANDS
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.command import interrupted_by_termination
@@ -37,6 +39,13 @@ ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has t
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     out, err = process.communicate(timeout=PATIENCE_S)
     return process.returncode, out, err
+
+
+def finish_here(toy: Toy, *options: str) -> tuple[int, str, str]:
+    """Run in this process, which saves most of the time of a small run."""
+    places = ("--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out"), "--executor", "serial")
+    result = CliRunner().invoke(app, ["run", str(toy.folder / "wf.yaml"), *places, *options])
+    return result.exit_code, result.stdout, result.stderr
 
 
 def events_of(text: str) -> list[dict[str, Any]]:
@@ -79,11 +88,10 @@ def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:
     assert {"a", "b"} <= set(err.split())
 
 
-@pytest.mark.slow
 def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:
     for number in range(1, 6):
         toy.number(f"{number}.txt", "not a number")
-    code, out, err = finish(start(toy, "--json", "--executor", "serial"))
+    code, out, err = finish_here(toy, "--json")
     assert code == 2
     assert events_of(out)[-1]["exit_code"] == 2
     assert "none of the 5 items" in err
@@ -221,11 +229,10 @@ def _state(pid: int) -> str:
     return path.read_text() if path.is_file() else ""
 
 
-@pytest.mark.slow
 def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:
     toy.number("3.txt", "13")
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("just before")'))
-    code, out, _ = finish(start(toy, "--executor", "serial"))
+    code, out, _ = finish_here(toy)
     assert code == 3
     assert "  | just before" in out
     assert "3.txt.log" in out
@@ -233,8 +240,6 @@ def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:
     assert "just before" not in [line.strip() for line in out.splitlines()], "units do not print among our lines"
 
 
-@ON_POSIX
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     [
@@ -248,7 +253,7 @@ def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str) -
     how = "sys.exit(0)"
     toy.edit("plug.py", lambda text: text.replace(place.strip().splitlines()[0], f"{place}{how}", 1))
     toy.edit("plug.py", lambda text: text.replace("import os\n", "import os, sys\n", 1))
-    code, _, err = finish(start(toy, "--executor", "serial"))
+    code, _, err = finish_here(toy)
     in_unit = "Multiply" in place
     assert code == (3 if in_unit else 2), err
     shown = (toy.folder / "out" / "report.html").read_text() if in_unit else err

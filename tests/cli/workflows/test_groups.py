@@ -127,7 +127,7 @@ stages:
   images:  {use: source.folder, path: IMAGES, max_width: WIDTH}
   poses:   {use: poses.from_model, path: poses.json}
   views:   {use: views.nearest}
-  depth:   {use: depth.sweep, planes: 32}
+  depth:   {use: depth.sweep, planes: 32, near: 0.3, far: 10}
   checked: {use: filters.consistency}
   median:  {use: filters.median}
 """

@@ -63,12 +63,19 @@ def test_a_workflow_can_say_what_the_paper_does(faithful: Path, tmp_path: Path, 
 FEW_PLANES = ("--set", "features.max_keypoints=3000", "--set", "depth.planes=48")
 
 
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache for all runs of the paper's workflow, so that its stages are computed once."""
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture
-def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
+def run(rendered: Path, pano_mvs: Command, cache: Path) -> Callable[..., dict[str, Any]]:
     def call(*overrides: str, out: str = "out") -> dict[str, Any]:
         options = [part for override in overrides for part in ("--set", override)]
         result = pano_mvs(
-            *f"run paper --images {rendered / 'images'} --out {out} --set scores.truth={rendered / 'truth'}".split(),
+            *f"run paper --images {rendered / 'images'} --out {out} --cache {cache}".split(),
+            *f"--set scores.truth={rendered / 'truth'}".split(),
             *FEW_PLANES,
             *options,
         )

@@ -86,9 +86,7 @@ def told(result: RunResult) -> object:
 
 # Slow tests of dask run before the slow ones here, and its loops are collected late.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize(
-    "workers", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("workers", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_processes_give_the_bytes_of_serial(toy: Toy, workers: int) -> None:
     serial = run_with(toy, SerialExecutor, name="serial")
     side_by_side = run_with(toy, lambda store: ProcessExecutor(store, workers=workers, threads=1), name="processes")
@@ -167,7 +165,7 @@ def test_many_inputs_reach_workers_through_a_file(toy: Toy, monkeypatch: pytest.
 
     for name, value in {"LARGE_INPUT": 3, "_ITEMS_PER_LINE": 2, "write_large_inputs": write}.items():
         monkeypatch.setattr(unit_requests, name, value)
-    side_by_side = run_with(toy, two_processes, name="processes")
+    side_by_side = run_with(toy, one_process, name="processes")
     assert written == [[2, 2, 1], [2, 2, 1], [2, 2]]
     assert told(side_by_side) == told(serial)
     assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")
@@ -257,7 +255,7 @@ def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -
     exits = "import os\nif 'PANO_MVS_WORKER' in os.environ: os._exit(0)\n"
     toy.edit("plug.py", lambda text: exits + text)
     with pytest.raises(InputError, match=r"(?s)none of the 5 items.*its worker process died \(exit code 0\)"):
-        run_with(toy, two_processes)
+        run_with(toy, one_process)
 
 
 @pytest.mark.parametrize("make", [SerialExecutor, one_process])
@@ -288,7 +286,7 @@ def test_timeout_ends_the_unit_and_not_the_run(toy: Toy, monkeypatch: pytest.Mon
         return run(self, request if request["unit"]["item"] == "2.txt" else {**request, "timeout_s": 0})
 
     monkeypatch.setattr(worker_process.WorkerProcess, "run", run_without_timeout)
-    result = run_with(toy, two_processes, "scaled.timeout_s=1")
+    result = run_with(toy, one_process, "scaled.timeout_s=1")
     failure = next(f for f in result.failures if f.stage == "scaled")
     assert failure.item == "2.txt"
     assert "timeout_s: 1" in failure.cause
@@ -380,7 +378,7 @@ if x.value == 30:
     with open({str(count)!r}, "a") as file: file.write("x")
     raise ValueError("again")
 """)
-    assert run_with(toy, two_processes, "scaled.retries=2").exit_code == 3
+    assert run_with(toy, one_process, "scaled.retries=2").exit_code == 3
     assert count.read_text() == "xxx"
 
 
@@ -461,7 +459,7 @@ def test_stage_that_changed_meanwhile_is_not_mistaken_for_the_old_one(toy: Toy) 
     session = toy.session()
     toy.edit("plug.py", lambda text: text.replace("2 * ", "3 * ").replace("* params.by / 2", "* params.by / 3"))
     store = Store(session.store_root)
-    executor = two_processes(store)
+    executor = one_process(store)
     try:
         with pytest.raises(UsageError, match="not the same in the worker"):
             Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()

@@ -28,7 +28,7 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params, RegisteredIn
 from tests.engine.conftest import Toy, ran, start
-from tests.engine.running.test_executors import Make, files_below, one_process, run_with, told, two_processes
+from tests.engine.running.test_executors import Make, files_below, one_process, run_with, told
 from tests.engine.running.test_run import ALL_UNITS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
@@ -103,7 +103,7 @@ def test_a_forked_child_neither_stores_nor_answers(toy: Toy) -> None:
     if x.value > 30: raise ValueError("child")
     return Number(666.0)
 open({str(pids)!r}, "a").write(f"{{child}} ")""")
-    result = run_with(toy, two_processes)
+    result = run_with(toy, one_process)
     assert told(result) == told(clean)
     assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
     assert ended(pids)
@@ -119,7 +119,7 @@ if x.value == 20:
     {child}
     open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
     time.sleep(600)""")
-    result = run_with(toy, two_processes, "scaled.timeout_s=3")
+    result = run_with(toy, one_process, "scaled.timeout_s=3")
     assert [(failure.stage, failure.item) for failure in result.failures if "timeout_s: 3" in failure.cause] == [
         ("scaled", "2.txt")
     ]
@@ -134,7 +134,7 @@ def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> Non
         open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
         time.sleep(600)
     os._exit(3)""")
-    result = run_with(toy, two_processes)
+    result = run_with(toy, one_process)
     assert ["its worker process died (exit code 3)" in failure.cause for failure in result.failures][:1] == [True]
     assert ended(pids)
 
@@ -205,7 +205,7 @@ def test_processes_of_other_sessions_end_with_the_run(toy: Toy, way: str, end: s
     then = {"run": "", "death": "os._exit(3)"}.get(end, "time.sleep(600)")
     pids = leave_behind(toy, way, then)
     if not end.startswith("SIG"):
-        assert run_with(toy, two_processes, "scaled.timeout_s=3").exit_code == (0 if end == "run" else 3)
+        assert run_with(toy, one_process, "scaled.timeout_s=3").exit_code == (0 if end == "run" else 3)
     else:
         process = start(toy, "--executor", "processes", "--workers", "2")
         while not pids.exists():
