@@ -18,8 +18,7 @@ from tests.synthetic.capture_files import write_capture
 
 PAGE = text_of("tutorials/settings.md")
 LESS = ["--executor", "serial"]  # and what makes the runs short
-LIMITS = ("depth.near=0.3", "depth.far=6")  # otherwise small sweeps find them, in most of the time
-for each in ("features.max_keypoints=1500", "weak.learned=never", "verified=null", "views.sources=2", *LIMITS):
+for each in ("features.max_keypoints=1500", "weak.learned=never", "verified=null", "views.sources=2"):
     LESS += ["--set", each]
 CAPTURES = {"lobby": 0.4, "flat": 0.5, "house": 0.6}  # the spread of the cameras
 
