@@ -74,8 +74,11 @@ def build(folder: Path, source: PluginSource, mode: Mode) -> None:
     """
     uv = shutil.which("uv") if mode == "isolated" else None
     python = python_in(folder)
-    make_folder(folder)
-    (folder / MARK).touch()  # first, so that an interrupted installation is known as such
+    # It has the mark as soon as it is there, so that an interrupted installation is known as such.
+    marked = folder.with_name(f".{MARK}")
+    make_folder(marked)
+    (marked / MARK).touch()
+    marked.rename(folder)
     try:
         if uv is not None:
             run_command([uv, "venv", "--quiet", "--allow-existing", "--python", sys.executable, str(folder)])
